@@ -1,0 +1,1 @@
+"""Plant, driver and simulator node for iwm_power_manager."""
