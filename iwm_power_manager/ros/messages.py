@@ -1,0 +1,224 @@
+"""Between standard ROS messages and plain numbers, both ways, for every topic of the project.
+
+Writers return a new message, readers return plain Python numbers; nobody else touches message fields. Readers convert
+and match by name, they do not judge the values: that is `control.inputs`. Sign of the battery current follows
+`sensor_msgs/BatteryState`: negative when discharging.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TwistStamped
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import Float64
+
+#: Default names of the wheels, in the order used everywhere (`control.types.Wheels`).
+WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
+
+#: Topics, relative names, so that they can be remapped and live in the node's namespace.
+VEHICLE_SPEED = "vehicle_speed"
+WHEEL_STATES = "wheel_states"
+POWER_DEMAND = "power_demand"
+ACCELERATOR_PEDAL = "accelerator_pedal"
+BRAKE_PEDAL = "brake_pedal"
+BATTERY_STATE = "battery_state"
+ROAD_FRICTION = "road_friction"
+WHEEL_TORQUE_COMMAND = "wheel_torque_command"
+FRICTION_BRAKE_COMMAND = "friction_brake_command"
+POWER_MANAGER_STATE = "power_manager/state"
+CLOCK = "/clock"
+
+#: Message type of every topic.
+TOPIC_TYPES: dict[str, type] = {
+    VEHICLE_SPEED: TwistStamped,
+    WHEEL_STATES: JointState,
+    POWER_DEMAND: Float64,
+    ACCELERATOR_PEDAL: Float64,
+    BRAKE_PEDAL: Float64,
+    BATTERY_STATE: BatteryState,
+    ROAD_FRICTION: Float64,
+    WHEEL_TORQUE_COMMAND: JointState,
+    FRICTION_BRAKE_COMMAND: JointState,
+    POWER_MANAGER_STATE: JointState,
+    CLOCK: Clock,
+}
+
+_NANOSECONDS = 1_000_000_000
+
+
+class SpeedReading(NamedTuple):
+    """`vehicle_speed` as numbers."""
+
+    stamp_ns: int
+    speed_mps: float
+
+
+class JointReading(NamedTuple):
+    """A JointState as numbers: one of its value fields, with the names it came with."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+
+
+class BatteryReading(NamedTuple):
+    """`battery_state` as numbers. `soc` and `temperature_c` are single precision, as the message carries them.
+
+    Attributes
+    ----------
+    stamp_ns : time of the measurement
+    soc : state of charge, 0..1 (NaN: not measured)
+    temperature_c : pack temperature (NaN: not measured)
+    voltage_v : terminal voltage
+    discharge_current_a : positive when discharging
+    """
+
+    stamp_ns: int
+    soc: float
+    temperature_c: float
+    voltage_v: float
+    discharge_current_a: float
+
+
+def stamp_to_ns(stamp: Time) -> int:
+    """Nanoseconds of a `builtin_interfaces/Time`."""
+    return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
+
+
+def ns_to_stamp(time_ns: int) -> Time:
+    """`builtin_interfaces/Time` of nanoseconds."""
+    return Time(sec=time_ns // _NANOSECONDS, nanosec=time_ns % _NANOSECONDS)
+
+
+def clock_message(time_ns: int) -> Clock:
+    """`/clock` at a time."""
+    return Clock(clock=ns_to_stamp(time_ns))
+
+
+def number_message(value: float) -> Float64:
+    """`power_demand` (W), `accelerator_pedal`, `brake_pedal` (0..1) or `road_friction`."""
+    return Float64(data=value)
+
+
+def read_number(message: Float64) -> float:
+    """Value of a Float64 message."""
+    return float(message.data)
+
+
+def vehicle_speed_message(stamp_ns: int, speed_mps: float, frame_id: str = "base_link") -> TwistStamped:
+    """`vehicle_speed`: the speed over ground along the car."""
+    message = TwistStamped()
+    message.header.stamp = ns_to_stamp(stamp_ns)
+    message.header.frame_id = frame_id
+    message.twist.linear.x = speed_mps
+    return message
+
+
+def read_vehicle_speed(message: TwistStamped) -> SpeedReading:
+    """`vehicle_speed` as numbers."""
+    return SpeedReading(stamp_to_ns(message.header.stamp), float(message.twist.linear.x))
+
+
+def joint_message(
+    stamp_ns: int,
+    names: Sequence[str],
+    *,
+    position: Sequence[float] = (),
+    velocity: Sequence[float] = (),
+    effort: Sequence[float] = (),
+) -> JointState:
+    """A JointState with the given fields: `wheel_states` or one of the two commands."""
+    message = JointState()
+    message.header.stamp = ns_to_stamp(stamp_ns)
+    message.name = list(names)
+    message.position = position
+    message.velocity = velocity
+    message.effort = effort
+    return message
+
+
+def wheel_states_message(
+    stamp_ns: int, names: Sequence[str], speed_radps: Sequence[float], torque_nm: Sequence[float]
+) -> JointState:
+    """`wheel_states`: wheel speeds (`velocity`) and the torques actually applied (`effort`)."""
+    return joint_message(stamp_ns, names, velocity=speed_radps, effort=torque_nm)
+
+
+def read_wheel_speeds(message: JointState) -> JointReading:
+    """Names and speeds (rad/s) of `wheel_states`, in the order of the message."""
+    return JointReading(stamp_to_ns(message.header.stamp), tuple(message.name), tuple(message.velocity))
+
+
+def torque_command_message(stamp_ns: int, names: Sequence[str], torque_nm: Sequence[float]) -> JointState:
+    """`wheel_torque_command` or `friction_brake_command`: a torque for each wheel."""
+    return joint_message(stamp_ns, names, effort=torque_nm)
+
+
+def read_torques(message: JointState) -> JointReading:
+    """Names and torques (N m) of a command or of `wheel_states`, in the order of the message."""
+    return JointReading(stamp_to_ns(message.header.stamp), tuple(message.name), tuple(message.effort))
+
+
+def battery_state_message(
+    stamp_ns: int,
+    *,
+    soc: float,
+    voltage_v: float,
+    discharge_current_a: float,
+    temperature_c: float = 25.0,
+    capacity_ah: float = math.nan,
+) -> BatteryState:
+    """`battery_state`; what is not measured is NaN, as the message's definition asks for."""
+    message = BatteryState()
+    message.header.stamp = ns_to_stamp(stamp_ns)
+    message.voltage = voltage_v
+    message.current = -discharge_current_a
+    message.temperature = temperature_c
+    message.charge = soc * capacity_ah
+    message.capacity = capacity_ah
+    message.design_capacity = capacity_ah
+    message.percentage = soc
+    message.power_supply_status = (
+        BatteryState.POWER_SUPPLY_STATUS_CHARGING
+        if discharge_current_a < 0.0
+        else BatteryState.POWER_SUPPLY_STATUS_DISCHARGING
+    )
+    message.power_supply_technology = BatteryState.POWER_SUPPLY_TECHNOLOGY_LIFE
+    message.present = True
+    return message
+
+
+def read_battery_state(message: BatteryState) -> BatteryReading:
+    """`battery_state` as numbers."""
+    return BatteryReading(
+        stamp_to_ns(message.header.stamp),
+        float(message.percentage),
+        float(message.temperature),
+        float(message.voltage),
+        -float(message.current),
+    )
+
+
+def named_numbers_message(stamp_ns: int, names: Sequence[str], values: Sequence[float]) -> JointState:
+    """A list of named numbers as a JointState (`power_manager/state`): `name` is the signal, `position` its value."""
+    return joint_message(stamp_ns, names, position=values)
+
+
+def read_named_numbers(message: JointState) -> tuple[int, dict[str, float]]:
+    """Stamp (ns) and values by name of a message made by `named_numbers_message`."""
+    return stamp_to_ns(message.header.stamp), dict(zip(message.name, message.position, strict=True))
+
+
+def select_by_name(reading: JointReading, wanted: Sequence[str]) -> tuple[float, ...]:
+    """Values of a JointState in the order of `wanted`; NaN where a name is absent, doubled, or has no value."""
+    if len(reading.names) != len(reading.values):
+        return (math.nan,) * len(wanted)
+    if reading.names == tuple(wanted):
+        return reading.values
+    found = dict(zip(reading.names, reading.values, strict=True))
+    return tuple(found[name] if reading.names.count(name) == 1 else math.nan for name in wanted)
