@@ -1,0 +1,1 @@
+"""What a command may do to the car; shared by the solver and the control law."""

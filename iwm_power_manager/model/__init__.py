@@ -1,0 +1,1 @@
+"""The control-oriented model: one equation group a file."""

@@ -1,0 +1,73 @@
+"""Limits of the battery (eq. 24, 43), with their derating by charge and temperature."""
+
+from __future__ import annotations
+
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.motor import electrical_power_w
+from iwm_power_manager.vehicle import Battery, Motor
+
+
+@kernel
+def fade(value: float, zero_at: float, full_at: float) -> float:
+    """0 at and beyond `zero_at`, 1 at and beyond `full_at`, linear between; the two may come in either order."""
+    return min(max((value - zero_at) / (full_at - zero_at), 0.0), 1.0)
+
+
+@kernel
+def battery_limits_w(soc: float, temperature_degc: float, battery: Battery) -> tuple[float, float]:
+    """Electrical power the battery may give and take, W, both >= 0.
+
+    A temperature that is not known (NaN) derates nothing.
+
+    Returns
+    -------
+    discharge limit, charge limit
+    """
+    discharge = battery.discharge_limit_w * fade(soc, battery.discharge_zero_below_soc, battery.discharge_full_above_soc)
+    charge = battery.charge_limit_w * fade(soc, battery.charge_zero_above_soc, battery.charge_full_below_soc)
+    if temperature_degc == temperature_degc:
+        hot = fade(temperature_degc, battery.power_zero_above_degc, battery.power_full_below_degc)
+        discharge *= hot
+        charge *= hot * fade(temperature_degc, battery.charge_zero_below_degc, battery.charge_full_above_degc)
+    return discharge, charge
+
+
+@kernel
+def car_power_w(
+    front_torque_nm: float, rear_torque_nm: float, front_speed_radps: float, rear_speed_radps: float, motor: Motor
+) -> float:
+    """Electrical power of the four motors, W (eq. 23), left and right alike."""
+    front = electrical_power_w(front_torque_nm, front_speed_radps, motor)
+    rear = electrical_power_w(rear_torque_nm, rear_speed_radps, motor)
+    return 2.0 * (front + rear)
+
+
+@kernel
+def battery_scale(
+    front_torque_nm: float,
+    rear_torque_nm: float,
+    front_speed_radps: float,
+    rear_speed_radps: float,
+    discharge_limit_w: float,
+    charge_limit_w: float,
+    motor: Motor,
+) -> float:
+    """Largest factor 0..1 on the motor torques that keeps the battery inside its limits (eq. 24, 43).
+
+    Where even standby or losses at zero torque are too much, the factor is 0: torque cannot help then.
+    """
+    power = car_power_w(front_torque_nm, rear_torque_nm, front_speed_radps, rear_speed_radps, motor)
+    if -charge_limit_w <= power <= discharge_limit_w:
+        return 1.0
+    low = 0.0
+    high = 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        power = car_power_w(
+            middle * front_torque_nm, middle * rear_torque_nm, front_speed_radps, rear_speed_radps, motor
+        )
+        if -charge_limit_w <= power <= discharge_limit_w:
+            low = middle
+        else:
+            high = middle
+    return low

@@ -1,0 +1,49 @@
+"""From power to motor and friction torque (eq. 12, 16-20, 40-42)."""
+
+from __future__ import annotations
+
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.motor import regeneration_limit_nm
+from iwm_power_manager.vehicle import VehicleParams
+
+
+@kernel
+def conversion_speed_radps(
+    wheel_speed_radps: float, speed_mps: float, critical_slip: float, vehicle: VehicleParams
+) -> float:
+    """Speed by which a power is divided to get a torque, rad/s.
+
+    Eq. 16 divides by the wheel's own speed, which diverges at rest and pulls a locking wheel into the lock. So the
+    divisor never falls below the wheel speed at the critical braking slip, nor below the speed floor. Inside the
+    desired slip interval, above the floor, it is eq. 16 as printed.
+    """
+    radius = vehicle.wheel.radius_m
+    held = speed_mps * (1.0 - critical_slip) / radius
+    return max(wheel_speed_radps, held, vehicle.driver.power_speed_floor_mps / radius)
+
+
+@kernel
+def allocate(front: float, rear: float, front_room: float, rear_room: float) -> tuple[float, float]:
+    """Give each axle what it asks for; what one has no room for goes to the other (all >= 0, in W)."""
+    front_given = min(front, front_room)
+    rear_given = min(rear + front - front_given, rear_room)
+    front_given = min(front + rear - rear_given, front_room)
+    return front_given, max(rear_given, 0.0)
+
+
+@kernel
+def blend(
+    torque_nm: float, wheel_speed_radps: float, speed_mps: float, heat: float, vehicle: VehicleParams
+) -> tuple[float, float]:
+    """Share a wheel's torque between its motor and its friction brake (eq. 20, 41, 42).
+
+    Driving is the motor's. Braking is the motor's up to the regeneration limit, the rest is friction's.
+
+    Returns
+    -------
+    motor torque (N m), friction torque (N m, <= 0)
+    """
+    if torque_nm >= 0.0:
+        return torque_nm, 0.0
+    regeneration = min(-torque_nm, regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, vehicle.motor))
+    return -regeneration, torque_nm + regeneration

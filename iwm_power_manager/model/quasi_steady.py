@@ -1,0 +1,105 @@
+"""Electrical power for a given road force and front share, with the slips settled.
+
+Slip settles within milliseconds, a decision about the split holds for 100 ms and more: for choosing the split, each
+tyre sits where the inverse Magic Formula puts it. The demand is met at the road (F_x * v), so that power spun away in
+slip costs what it costs and buys nothing. What an axle cannot give (tyre, motor) goes to the other one, as the control
+law does it; what neither can give is returned, not hidden.
+"""
+
+from __future__ import annotations
+
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.battery import chemical_power_w
+from iwm_power_manager.model.chassis import equivalent_mass_kg, normal_forces_n, road_load_n
+from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
+from iwm_power_manager.model.tyre import slip_at_friction, wheel_speed_at_slip
+from iwm_power_manager.vehicle import VehicleParams
+
+#: Part of the peak friction a strategy plans with. The rest is the distance the slip limiter keeps from the peak.
+USABLE_FRICTION = 0.99
+
+
+@kernel
+def axle_power_w(
+    force_n: float, speed_mps: float, normal_n: float, friction: float, slip_aware: bool, vehicle: VehicleParams
+) -> float:
+    """Electrical power of an axle's two motors, W, for the axle's road force (braking negative).
+
+    Braking beyond the regeneration limit is friction's and brings nothing.
+    """
+    radius = vehicle.wheel.radius_m
+    motor = vehicle.motor
+    slip = 0.0
+    if slip_aware and normal_n > 0.0:
+        slip = slip_at_friction(0.5 * force_n / normal_n, friction, vehicle.tyre)
+    wheel_speed = wheel_speed_at_slip(slip, speed_mps, radius)
+    torque = 0.5 * force_n * radius
+    if torque < 0.0:
+        torque = -min(-torque, regeneration_limit_nm(wheel_speed, speed_mps, 0.0, motor))
+    return 2.0 * electrical_power_w(torque, wheel_speed, motor)
+
+
+@kernel
+def split_power_w(
+    force_n: float, speed_mps: float, front_share: float, friction: float, slip_aware: bool, vehicle: VehicleParams
+) -> tuple[float, float]:
+    """Chemical battery power for a road force at a front share, and the force that cannot be delivered.
+
+    Parameters
+    ----------
+    force_n : sum of the tyre forces asked for, N, braking negative
+    speed_mps : vehicle speed, > 0
+    front_share : front axle's part of the force, 0..1; at 0 and 1 the other axle is idle
+    friction : peak friction coefficient
+    slip_aware : False ignores slip, load transfer and the tyre's limit
+
+    Returns
+    -------
+    battery power (W, eq. 21), missing force (N, >= 0)
+    """
+    chassis = vehicle.chassis
+    radius = vehicle.wheel.radius_m
+    motor = vehicle.motor
+    rolling_speed = speed_mps / radius
+    acceleration = (force_n - road_load_n(speed_mps, 0.0, chassis)) / equivalent_mass_kg(vehicle)
+    normal_front, normal_rear = normal_forces_n(acceleration, speed_mps, 0.0, chassis)
+
+    front = front_share * force_n
+    rear = force_n - front
+    # An idle axle's drag is a force too; the working axle has to overcome it.
+    drag = 2.0 * idle_drag_nm(0.0, rolling_speed, motor) / radius
+    if front == 0.0 and rear == 0.0:
+        return chemical_power_w(4.0 * electrical_power_w(0.0, rolling_speed, motor), vehicle.battery), 0.0
+    if front == 0.0:
+        rear += drag
+    elif rear == 0.0:
+        front += drag
+    sign = 1.0 if force_n > 0.0 else -1.0
+    need_front = max(sign * front, 0.0)
+    need_rear = max(sign * rear, 0.0)
+
+    room_front = 1e12
+    room_rear = 1e12
+    if slip_aware:
+        grip = 2.0 * USABLE_FRICTION * friction * vehicle.tyre.peak_factor
+        room_front = grip * normal_front
+        room_rear = grip * normal_rear
+    if sign > 0.0:
+        motors = 2.0 * torque_limit_nm(rolling_speed, 0.0, motor) / radius
+        room_front = min(room_front, motors)
+        room_rear = min(room_rear, motors)
+    given_front = min(need_front, room_front)
+    given_rear = min(need_rear + need_front - given_front, room_rear)
+    given_front = min(need_front + need_rear - given_rear, room_front)
+    missing = need_front + need_rear - given_front - given_rear
+
+    power = axle_power_w(sign * given_front, speed_mps, normal_front, friction, slip_aware, vehicle) + axle_power_w(
+        sign * given_rear, speed_mps, normal_rear, friction, slip_aware, vehicle
+    )
+    return chemical_power_w(power, vehicle.battery), missing
+
+
+@kernel
+def demand_force_n(power_demand_w: float, speed_mps: float, vehicle: VehicleParams) -> float:
+    """Road force a power demand stands for, N; eq. 16 with its speed floor."""
+    return power_demand_w / max(speed_mps, vehicle.driver.power_speed_floor_mps)
