@@ -1,0 +1,344 @@
+"""Builders of the paper's figures: arrays in, a matplotlib figure out.
+
+Nothing here computes a result or touches a file. A figure suits the page (`report.Pictures`) and print alike. The style
+holds while a figure is built and leaves matplotlib's own settings as they were.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, cast
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+from iwm_sim.study.palette import COLOURS, INK
+
+#: Narrow enough that its text stays readable when the page scales it to a phone.
+WIDTH_IN = 5.2
+BLUE, VERMILION, GREEN, PURPLE, OCHRE, SKY, GREY, BLACK = COLOURS
+
+_STYLE: dict[str, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 10.0,
+    "axes.titlesize": 10.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": COLOURS[6],
+    "grid.alpha": 0.25,
+    "grid.linewidth": 0.6,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "lines.linewidth": 1.6,
+    "legend.frameon": False,
+    "legend.fontsize": 9.0,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+}
+
+
+class Curve(NamedTuple):
+    """Battery depletion over the front axle's power.
+
+    Attributes
+    ----------
+    label : what it was computed for
+    front_power_w : (N,)
+    delta_soc_percent : (N,) depletion of one step, NaN where the split cannot be driven
+    """
+
+    label: str
+    front_power_w: ArrayLike
+    delta_soc_percent: ArrayLike
+
+
+class SplitRun(NamedTuple):
+    """Axle powers of one strategy.
+
+    Attributes
+    ----------
+    label : name of the strategy
+    front_power_w, rear_power_w : (N,)
+    """
+
+    label: str
+    front_power_w: ArrayLike
+    rear_power_w: ArrayLike
+
+
+class SlipRun(NamedTuple):
+    """Axle slips of one run.
+
+    Attributes
+    ----------
+    label : name of the run
+    front_slip, rear_slip : (N,)
+    """
+
+    label: str
+    front_slip: ArrayLike
+    rear_slip: ArrayLike
+
+
+def _styled[**P](build: Callable[P, Figure]) -> Callable[P, Figure]:
+    @functools.wraps(build)
+    def styled(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with mpl.rc_context(cast(Any, _STYLE)):
+            return build(*args, **kwargs)
+
+    return styled
+
+
+@_styled
+def model_comparison(
+    time_s: ArrayLike,
+    plant_speed_mps: ArrayLike,
+    model_speed_mps: ArrayLike,
+    plant_soc: ArrayLike,
+    model_soc: ArrayLike,
+) -> Figure:
+    """Fig. 7: speed and state of charge (0..1) of the plant and of the control-oriented model, all (N,)."""
+    figure, (speed, soc) = _axes(2, height_in=4.6)
+    speed.plot(time_s, plant_speed_mps, color=BLUE, label="plant")
+    speed.plot(time_s, model_speed_mps, color=VERMILION, linestyle="--", label="control model")
+    speed.set_ylabel("Speed, m/s")
+    soc.plot(time_s, 100.0 * np.asarray(plant_soc), color=BLUE, label="plant")
+    soc.plot(time_s, 100.0 * np.asarray(model_soc), color=VERMILION, linestyle="--", label="control model")
+    soc.set_ylabel("State of charge, %")
+    soc.legend(loc="upper right")
+    _time_axis(soc, time_s)
+    return figure
+
+
+def depletion_over_split(curves: Sequence[Curve], title: str = "") -> Figure:
+    """Fig. 8 (a curve for each speed) and Fig. 9 (for each slip): depletion of a step over the front axle's power."""
+    return depletion_over_split_panels([(title, curves)])
+
+
+@_styled
+def depletion_over_split_panels(panels: Sequence[tuple[str, Sequence[Curve]]]) -> Figure:
+    """Fig. 10: the same for several demands, a titled panel each. The least depletion of a curve carries a dot."""
+    figure, axes = _axes(len(panels), height_in=1.2 + 2.2 * len(panels), share_x=False)
+    for axis, (title, curves) in zip(axes, panels, strict=True):
+        for index, curve in enumerate(curves):
+            power_kw = np.asarray(curve.front_power_w, dtype=np.float64) / 1000.0
+            depletion = np.asarray(curve.delta_soc_percent, dtype=np.float64)
+            axis.plot(power_kw, depletion, color=COLOURS[index % 6], label=curve.label)
+            if np.isfinite(depletion).any():
+                # A tie within a billionth is a tie: both of two symmetric optima are marked.
+                least = np.nanmin(depletion)
+                best = np.flatnonzero(depletion <= least + 1e-9 * abs(least))
+                axis.plot(power_kw[best], depletion[best], "o", markersize=5, color=COLOURS[index % 6])
+        axis.set_title(title)
+        axis.set_ylabel("ΔSoC per step, %")
+        if len(curves) > 1:
+            axis.legend(ncols=min(3, len(curves)))
+    axes[-1].set_xlabel("Power of the front axle, kW")
+    return figure
+
+
+@_styled
+def policy_convergence(policy_change_w: ArrayLike, bellman_residual: ArrayLike | None = None) -> Figure:
+    """Fig. 12: how policy iteration converges.
+
+    Parameters
+    ----------
+    policy_change_w : (K,) norm of the change of the policy in each iteration, W; zeros are drawn on the axis' floor
+    bellman_residual : (K,) largest change of the cost-to-go, on an axis of its own; None leaves it out
+    """
+    change = np.asarray(policy_change_w, dtype=np.float64)
+    iteration = np.arange(1, len(change) + 1)
+    figure, axes = _axes(1 if bellman_residual is None else 2, height_in=3.2 if bellman_residual is None else 4.8)
+    axes[0].plot(iteration, change, "o-", color=BLUE, markersize=4)
+    # Linear below the smallest change: the last iteration changes nothing, and a log axis has no zero.
+    positive = change[change > 0.0]
+    axes[0].set_yscale("symlog", linthresh=float(positive.min()) if len(positive) else 1.0)
+    axes[0].set_ylabel("Change of the policy, W")
+    if bellman_residual is not None:
+        axes[1].semilogy(iteration, bellman_residual, "s-", color=VERMILION, markersize=4)
+        axes[1].set_ylabel("Bellman residual")
+    axes[-1].set_xlabel("Iteration")
+    axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
+    return figure
+
+
+@_styled
+def fitted_rule(
+    power_demand_w: ArrayLike,
+    front_power_w: ArrayLike,
+    rule_demand_w: ArrayLike,
+    rule_front_power_w: ArrayLike,
+) -> Figure:
+    """Fig. 13: what dynamic programming chose, (N,) points, and the rule fitted to it, (M,) points of a line."""
+    figure, (axis,) = _axes(1, height_in=3.6)
+    demand_kw = np.asarray(power_demand_w, dtype=np.float64) / 1000.0
+    axis.plot(
+        demand_kw,
+        np.asarray(front_power_w) / 1000.0,
+        ".",
+        markersize=3,
+        alpha=0.35,
+        color=BLUE,
+        label="dynamic programming",
+        # Thousands of points as vector would be megabytes.
+        rasterized=True,
+    )
+    axis.plot(
+        np.asarray(rule_demand_w) / 1000.0,
+        np.asarray(rule_front_power_w) / 1000.0,
+        color=VERMILION,
+        linewidth=2.0,
+        label="fitted rule",
+    )
+    ends = np.array([demand_kw.min(), demand_kw.max()])
+    axis.plot(ends, 0.5 * ends, color=GREY, linestyle=":", label="equal distribution")
+    axis.set_xlabel("Power demand, kW")
+    axis.set_ylabel("Power of the front axle, kW")
+    axis.legend(loc="upper left")
+    return figure
+
+
+@_styled
+def axle_powers(time_s: ArrayLike, runs: Sequence[SplitRun], window_s: tuple[float, float]) -> Figure:
+    """Fig. 14: front and rear power of strategies inside a window of time, s."""
+    figure, axes = _axes(2, height_in=4.6)
+    inside = _inside(time_s, window_s)
+    time = np.asarray(time_s, dtype=np.float64)[inside]
+    for index, run in enumerate(runs):
+        for axis, power in zip(axes, (run.front_power_w, run.rear_power_w), strict=True):
+            axis.plot(
+                time,
+                np.asarray(power, dtype=np.float64)[inside] / 1000.0,
+                color=COLOURS[index % 6],
+                linewidth=1.3,
+                label=run.label,
+            )
+    axes[0].set_ylabel("Front power, kW")
+    axes[1].set_ylabel("Rear power, kW")
+    axes[0].legend(ncols=len(runs))
+    _time_axis(axes[1], time)
+    return figure
+
+
+@_styled
+def slips(
+    time_s: ArrayLike, runs: Sequence[SlipRun], critical_slip: float, window_s: tuple[float, float] | None = None
+) -> Figure:
+    """Fig. 15: slip of the front (a) and rear (b) axle, with the critical slip marked on both sides."""
+    figure, axes = _axes(2, height_in=4.8)
+    inside = _inside(time_s, window_s)
+    time = np.asarray(time_s, dtype=np.float64)[inside]
+    for index, run in enumerate(runs):
+        for axis, slip in zip(axes, (run.front_slip, run.rear_slip), strict=True):
+            axis.plot(
+                time,
+                np.asarray(slip, dtype=np.float64)[inside],
+                color=(VERMILION, BLUE, GREEN)[index % 3],
+                linewidth=1.2,
+                label=run.label,
+            )
+    for axis, label in zip(axes, ("(a) Front slip", "(b) Rear slip"), strict=True):
+        for level in (-critical_slip, critical_slip):
+            axis.axhline(level, color=GREY, linestyle=":", linewidth=1.0)
+        axis.set_ylabel(label)
+    axes[0].legend(loc="lower left", ncols=len(runs))
+    _time_axis(axes[1], time)
+    return figure
+
+
+@_styled
+def transition_matrix(probability: ArrayLike, power_w: ArrayLike) -> Figure:
+    """The demand's transition matrix (N, N), rows summing to one, over its grid of power (N,), W."""
+    matrix = np.asarray(probability, dtype=np.float64)
+    power_kw = np.asarray(power_w, dtype=np.float64) / 1000.0
+    figure, (axis,) = _axes(1, height_in=4.3)
+    positive = matrix[matrix > 0.0]
+    # A grid point stands in the middle of its cell; the outermost cells are as wide as their neighbours.
+    outer = (2.0 * power_kw[0] - power_kw[1], 2.0 * power_kw[-1] - power_kw[-2])
+    centres = np.concatenate((outer[:1], power_kw, outer[1:]))
+    edges = (centres[1:] + centres[:-1]) / 2.0
+    image = axis.pcolormesh(
+        edges,
+        edges,
+        np.ma.masked_less_equal(matrix, 0.0),
+        cmap="cividis",
+        norm=LogNorm(float(positive.min()), 1.0),
+        rasterized=True,
+    )
+    axis.set_aspect("equal")
+    axis.grid(visible=False)
+    axis.set_xlabel("Power demand one step later, kW")
+    axis.set_ylabel("Power demand now, kW")
+    bar = figure.colorbar(image, ax=axis, shrink=0.9)
+    bar.set_label("Probability")
+    return figure
+
+
+@_styled
+def bars_by_cycle(
+    cycles: Sequence[str],
+    values: Mapping[str, Sequence[float]],
+    label: str,
+    valid: Mapping[str, Sequence[bool]] | None = None,
+) -> Figure:
+    """A group of bars for each cycle, a bar for each strategy; runs that are not valid are hatched.
+
+    Parameters
+    ----------
+    cycles : names of the groups
+    values : by strategy, a value for each cycle (NaN: none)
+    label : of the axis, with unit
+    valid : by strategy, whether each value may be compared
+    """
+    figure, (axis,) = _axes(1, height_in=3.4)
+    width = 0.82 / max(1, len(values))
+    for index, (name, heights) in enumerate(values.items()):
+        x = np.arange(len(cycles)) + (index - (len(values) - 1) / 2) * width
+        bars = axis.bar(x, heights, width * 0.92, color=COLOURS[index % 7], label=name)
+        for bar, good in zip(bars, valid[name] if valid else (), strict=False):
+            if not good:
+                bar.set(fill=False, hatch="////", edgecolor=COLOURS[index % 7])
+    axis.axhline(0.0, color=INK, linewidth=0.8)
+    axis.set_xticks(range(len(cycles)), cycles)
+    axis.grid(visible=False, axis="x")
+    axis.set_ylabel(label)
+    axis.legend(ncols=min(4, len(values)), loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return figure
+
+
+def _axes(rows: int, height_in: float, share_x: bool = True) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    axes = figure.subplots(rows, 1, sharex=share_x, squeeze=False)[:, 0]
+    return figure, list(axes)
+
+
+def _time_axis(axis: Axes, time_s: ArrayLike) -> None:
+    axis.set_xlabel("Time, s")
+    time = np.asarray(time_s, dtype=np.float64)
+    axis.set_xlim(float(time.min()), float(time.max()))
+
+
+def _inside(time_s: ArrayLike, window_s: tuple[float, float] | None) -> np.ndarray:
+    time = np.asarray(time_s, dtype=np.float64)
+    if window_s is None:
+        return np.ones(len(time), dtype=bool)
+    inside = (time >= window_s[0]) & (time <= window_s[1])
+    if not inside.any():
+        raise ValueError(f"no sample between {window_s[0]} s and {window_s[1]} s")
+    return np.asarray(inside)

@@ -1,0 +1,94 @@
+"""The figure builders: what is drawn is what was given, with units on every axis and the style left as it was."""
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from iwm_sim.study import figures as f
+
+TIME = np.arange(0.0, 100.0, 0.5)
+WAVE = np.sin(TIME)
+BOWL = f.Curve("10 m/s", np.linspace(0.0, 10e3, 11), (np.linspace(0.0, 10e3, 11) - 3e3) ** 2)
+
+
+def built():
+    """Every figure of the paper, small."""
+    return {
+        "fig7": f.model_comparison(TIME, WAVE, WAVE + 0.1, 0.9 - TIME / 1e4, 0.9 - TIME / 1.1e4),
+        "fig8": f.depletion_over_split([BOWL, BOWL._replace(label="20 m/s")]),
+        "fig10": f.depletion_over_split_panels([("(a) 1 kW", [BOWL]), ("(b) 5 kW", [BOWL])]),
+        "fig12": f.policy_convergence([300.0, 20.0, 0.0], [1.0, 1e-3, 1e-9]),
+        "fig13": f.fitted_rule(1e3 * WAVE, 600.0 * WAVE, [-1e3, 1e3], [-600.0, 600.0]),
+        "fig14": f.axle_powers(TIME, [f.SplitRun("sdp", 1e3 * WAVE, 2e3 * WAVE)], (20.0, 40.0)),
+        "fig15": f.slips(TIME, [f.SlipRun("with", WAVE, WAVE), f.SlipRun("without", WAVE, WAVE)], 0.2),
+        "transitions": f.transition_matrix(np.array([[0.9, 0.1], [0.0, 1.0]]), [0.0, 1e3]),
+        "bars": f.bars_by_cycle(
+            ["NYCC"], {"sdp": [1.0], "rule": [float("nan")]}, "Saving, %", {"sdp": [True], "rule": [False]}
+        ),
+    }
+
+
+@pytest.fixture(scope="module")
+def figures():
+    return built()
+
+
+def test_every_number_axis_is_labelled_with_its_unit(figures):
+    unitless = {"Iteration", "Bellman residual", "(a) Front slip", "(b) Rear slip", "Probability", ""}
+    for name, figure in figures.items():
+        labels = [axis.get_ylabel() for axis in figure.axes] + [axis.get_xlabel() for axis in figure.axes]
+        assert figure.axes[0].get_ylabel(), name
+        for label in labels:
+            assert label in unitless or ", " in label, f"{name}: {label!r} has no unit"
+
+
+def test_building_leaves_matplotlibs_own_settings_alone():
+    before = dict(mpl.rcParams)
+    built()
+    assert dict(mpl.rcParams) == before
+
+
+def test_the_least_depletion_carries_the_dot(figures):
+    dot = figures["fig8"].axes[0].lines[1]
+    assert list(dot.get_xdata()) == [3.0]
+
+
+def test_both_of_two_symmetric_optima_are_marked():
+    power = np.linspace(0.0, 10.0, 11)
+    double = f.Curve("", power, ((power - 2.0) * (power - 8.0)) ** 2)
+    dots = f.depletion_over_split([double]).axes[0].lines[1]
+    assert len(dots.get_xdata()) == 2
+
+
+def test_a_split_that_cannot_be_driven_is_a_gap_without_a_dot():
+    nothing = f.Curve("", [0.0, 1.0], [np.nan, np.nan])
+    assert len(f.depletion_over_split([nothing]).axes[0].lines) == 1
+
+
+def test_powers_are_drawn_in_kilowatts_inside_the_window(figures):
+    front = figures["fig14"].axes[0].lines[0]
+    assert front.get_xdata().min() == 20.0
+    assert front.get_xdata().max() == 40.0
+    inside = (TIME >= 20.0) & (TIME <= 40.0)
+    np.testing.assert_allclose(front.get_ydata(), WAVE[inside])
+
+
+def test_a_window_outside_the_drive_is_refused():
+    with pytest.raises(ValueError, match="no sample between"):
+        f.axle_powers(TIME, [f.SplitRun("sdp", WAVE, WAVE)], (500.0, 600.0))
+
+
+def test_the_last_policy_iteration_may_change_nothing(figures):
+    line = figures["fig12"].axes[0].lines[0]
+    assert line.get_ydata()[-1] == 0.0
+    assert figures["fig12"].axes[0].get_yscale() == "symlog"
+
+
+def test_demand_classes_stand_in_the_middle_of_their_cells(figures):
+    edges = figures["transitions"].axes[0].collections[0].get_coordinates()[0, :, 0]
+    np.testing.assert_allclose(edges, [-0.5, 0.5, 1.5])
+
+
+def test_a_run_that_may_not_be_compared_is_hatched(figures):
+    hatches = [bar.get_hatch() for bar in figures["bars"].axes[0].patches]
+    assert hatches == [None, "////"]
