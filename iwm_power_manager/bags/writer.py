@@ -1,0 +1,273 @@
+"""Write a rosbag2 bag: a folder of MCAP files with `metadata.yaml`, version 9. Needs no ROS.
+
+Messages come as the CDR bytes they had on the wire and stay that. A bag is split into files by size or by duration;
+each file carries every schema and the custom metadata, so that each can be read, or recovered, alone.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from .. import __version__
+from ..errors import BagError, ConfigError
+from ..files import atomic_write
+from .mcap_file import COMPRESSIONS, McapFile
+from .metadata import (
+    METADATA_FILE,
+    FileSpan,
+    Topic,
+    bag_information,
+    information_text,
+    metadata_text,
+    qos_text,
+)
+
+LIBRARY = f"iwm_power_manager {__version__}"
+#: Name of the MCAP metadata record that holds the custom metadata from the first byte on, for the case of a crash.
+CUSTOM_METADATA = "iwm_power_manager"
+
+DEFAULT_CHUNK_BYTES = 786_432
+
+
+@dataclass(frozen=True)
+class WriterOptions:
+    """How a bag is written.
+
+    Attributes
+    ----------
+    compression : "none", "lz4" or "zstd", of each chunk
+    chunk_bytes : uncompressed size at which a chunk is closed
+    max_bytes : size at which a file is closed and the next begun; 0 for no limit
+    max_duration_ns : the same by log time; 0 for no limit
+    max_message_bytes : a larger message is refused
+    """
+
+    compression: str = "zstd"
+    chunk_bytes: int = DEFAULT_CHUNK_BYTES
+    max_bytes: int = 0
+    max_duration_ns: int = 0
+    max_message_bytes: int = 64 * 1024 * 1024
+
+    def __post_init__(self) -> None:
+        if self.compression not in COMPRESSIONS:
+            raise BagError(f"compression: {self.compression!r} is unknown; allowed: {' | '.join(COMPRESSIONS)}")
+        for name, low in (("chunk_bytes", 1024), ("max_bytes", 0), ("max_duration_ns", 0), ("max_message_bytes", 1)):
+            value = getattr(self, name)
+            if value < low:
+                raise BagError(f"{name}: {value} is too small; allowed: >= {low}")
+
+
+class MessageTooLarge(BagError):
+    """A message is larger than `WriterOptions.max_message_bytes`; it was not written, the bag is unharmed."""
+
+
+class BagWriter:
+    """A new rosbag2 bag.
+
+    Parameters
+    ----------
+    path : folder to create; an existing one is never touched
+    options : compression, splits and limits
+    custom_data : free text by key, for `custom_data` of the metadata
+
+    Raises
+    ------
+    BagError
+        The folder exists or cannot be written. Later, from every writing method: the disk is full, the folder is gone
+        or the like; then close the bag, which keeps what was written.
+    """
+
+    def __init__(
+        self, path: Path | str, options: WriterOptions | None = None, custom_data: Mapping[str, str] | None = None
+    ) -> None:
+        self.path = Path(path)
+        self.options = options or WriterOptions()
+        self.custom_data = dict(custom_data or {})
+        self._topics: list[Topic] = []
+        self._counts: list[int] = []
+        self._channels: list[int] = []
+        self._spans: list[FileSpan] = []
+        self._file_start_ns = 0
+        self._file_has_message = False
+        self._closed = False
+        self._closed_bytes = 0
+        try:
+            self.path.mkdir(parents=True)
+        except FileExistsError:
+            raise BagError(f"{self.path}: exists already and is not overwritten; choose another name") from None
+        except OSError as error:
+            raise BagError(f"{self.path}: cannot be created: {error.strerror or error}") from None
+        self._file = self._open_file()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def size_bytes(self) -> int:
+        """What is on disk in all files of the bag."""
+        return self._closed_bytes + (0 if self._closed else self._file.size_bytes)
+
+    @property
+    def message_count(self) -> int:
+        """Messages on disk; those of the chunk in memory are not counted yet."""
+        return sum(span.message_count for span in self._spans) + (0 if self._closed else self._file.message_count)
+
+    @property
+    def file_count(self) -> int:
+        """Files of the bag so far."""
+        return len(self._spans) + (0 if self._closed else 1)
+
+    def add_topic(self, topic: Topic) -> int:
+        """Announce a topic; returns the number that `write` takes."""
+        self._topics.append(topic)
+        self._counts.append(0)
+        try:
+            self._channels.append(self._add_channel(self._file, topic))
+        except OSError as error:
+            raise self._failed(error) from None
+        return len(self._topics) - 1
+
+    def set_custom_data(self, values: Mapping[str, str]) -> None:
+        """Add to the custom metadata, on disk at once."""
+        self.custom_data.update(values)
+        try:
+            self._file.add_metadata(CUSTOM_METADATA, dict(values))
+        except OSError as error:
+            raise self._failed(error) from None
+
+    def write(
+        self, topic: int, log_time_ns: int, data: bytes, publish_time_ns: int | None = None, sequence: int = 0
+    ) -> None:
+        """Write one message.
+
+        Parameters
+        ----------
+        topic : what `add_topic` returned
+        log_time_ns : when it was received, the time readers sort by
+        data : the message as CDR, with its four bytes of encapsulation
+        publish_time_ns : when it was sent; None for the log time
+        sequence : the publisher's counter, 0 if unknown
+        """
+        options = self.options
+        if len(data) > options.max_message_bytes:
+            raise MessageTooLarge(
+                f"{self.path}: {self._topics[topic].name}: a message of {len(data)} bytes was not written; "
+                f"allowed: <= {options.max_message_bytes}"
+            )
+        if not self._file_has_message:
+            self._file_start_ns = log_time_ns
+            self._file_has_message = True
+        elif (options.max_duration_ns and log_time_ns - self._file_start_ns >= options.max_duration_ns) or (
+            options.max_bytes and self._file.size_bytes + self._file.pending_bytes + len(data) > options.max_bytes
+        ):
+            self.split()
+            self._file_start_ns = log_time_ns
+            self._file_has_message = True
+        try:
+            self._file.write(
+                self._channels[topic],
+                log_time_ns,
+                log_time_ns if publish_time_ns is None else publish_time_ns,
+                sequence & 0xFFFFFFFF,
+                data,
+            )
+        except OSError as error:
+            raise self._failed(error) from None
+
+    def flush(self, sync: bool = False) -> None:
+        """Bring everything given so far into the file; with `sync` onto the disk."""
+        try:
+            self._file.flush(sync)
+        except OSError as error:
+            raise self._failed(error) from None
+
+    def split(self) -> None:
+        """Close the current file and begin the next."""
+        if not self._file_has_message:
+            return
+        self._finish_file()
+        self._file = self._open_file()
+
+    def close(self) -> None:
+        """Close the file and write `metadata.yaml`. Closing twice does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._finish_file()
+        finally:
+            self._write_metadata()
+
+    def abandon(self) -> None:
+        """Close without index and metadata, as a crash would leave the bag (see `recover`)."""
+        self._closed = True
+        self._file.abandon()
+
+    def _file_name(self) -> str:
+        return f"{self.path.name}_{len(self._spans)}.mcap"
+
+    def _open_file(self) -> McapFile:
+        try:
+            file = McapFile(
+                self.path / self._file_name(),
+                library=LIBRARY,
+                compression=self.options.compression,
+                chunk_bytes=self.options.chunk_bytes,
+            )
+            if self.custom_data:
+                file.add_metadata(CUSTOM_METADATA, self.custom_data)
+            self._channels = [self._add_channel(file, topic) for topic in self._topics]
+        except OSError as error:
+            raise self._failed(error) from None
+        self._file_has_message = False
+        return file
+
+    def _add_channel(self, file: McapFile, topic: Topic) -> int:
+        schema = file.schema_id(topic.type, "ros2msg" if topic.definition else "", topic.definition)
+        return file.add_channel(
+            topic.name, schema, {"offered_qos_profiles": qos_text(topic.qos), "topic_type_hash": topic.type_hash}
+        )
+
+    def _finish_file(self) -> None:
+        file = self._file
+        try:
+            file.flush()
+            span = self._span(file)
+            information = bag_information("mcap", [span], self._topic_counts(file), self.custom_data)
+            file.add_metadata("rosbag2", {"serialized_metadata": information_text(information)})
+            file.finish()
+        except OSError as error:
+            file.abandon()
+            raise self._failed(error) from None
+        finally:
+            for index, channel in enumerate(self._channels):
+                self._counts[index] += file.channel_counts.get(channel, 0)
+            self._spans.append(self._span(file))
+            self._closed_bytes += file.size_bytes
+
+    def _topic_counts(self, file: McapFile) -> list[tuple[Topic, int]]:
+        return [
+            (topic, file.channel_counts[channel]) for topic, channel in zip(self._topics, self._channels, strict=True)
+        ]
+
+    @staticmethod
+    def _span(file: McapFile) -> FileSpan:
+        return FileSpan(file.path.name, file.start_time_ns, file.end_time_ns, file.message_count)
+
+    def _write_metadata(self) -> None:
+        topics = list(zip(self._topics, self._counts, strict=True))
+        text = metadata_text(bag_information("mcap", self._spans, topics, self.custom_data))
+        try:
+            atomic_write(self.path / METADATA_FILE, text.encode())
+        except (ConfigError, OSError) as error:
+            raise BagError(f"{self.path}: metadata.yaml cannot be written: {error}") from None
+
+    def _failed(self, error: OSError) -> BagError:
+        return BagError(f"{self.path}: cannot be written: {error.strerror or os.fspath(self.path)}")

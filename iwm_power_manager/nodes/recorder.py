@@ -1,0 +1,382 @@
+"""Node `recorder`: writes topics to a rosbag2 MCAP bag as the bytes that came over the wire.
+
+Three threads share the work: this module's main loop takes messages from DDS (`ros.raw`), the recording writes them
+(`bags.recording`), and an rclpy executor serves parameters, services and the status timer.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import signal
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from .. import __version__
+from ..bags.definitions import definition_of
+from ..bags.mcap_file import COMPRESSIONS
+from ..bags.metadata import Topic
+from ..bags.recording import FAILED, Recording, RecordingOptions, Sample
+from ..bags.writer import WriterOptions
+from ..errors import BagError, IwmError
+from ..files import sha256_of
+from ..ros.messages import (
+    CLOCK,
+    FRICTION_BRAKE_COMMAND,
+    POWER_DEMAND,
+    POWER_MANAGER_STATE,
+    TOPIC_TYPES,
+    VEHICLE_SPEED,
+    WHEEL_STATES,
+    WHEEL_TORQUE_COMMAND,
+    ns_to_stamp,
+)
+from ..ros.parameters import Change, ParameterError, Spec, Value, declare
+from ..ros.raw import RawSubscriptions, Taken
+
+DIAGNOSTICS = "/diagnostics"
+DEFAULT_TOPICS = [*TOPIC_TYPES, DIAGNOSTICS]
+#: What a closed loop cannot run without: `~/ready` waits for these.
+DEFAULT_WAIT_FOR = [
+    VEHICLE_SPEED,
+    WHEEL_STATES,
+    POWER_DEMAND,
+    WHEEL_TORQUE_COMMAND,
+    FRICTION_BRAKE_COMMAND,
+    POWER_MANAGER_STATE,
+]
+
+_MEBIBYTE = 1024 * 1024
+_STATUS_PERIOD_S = 1.0
+_DISCOVERY_FAST_S = 0.05
+_DISCOVERY_SLOW_S = 0.5
+#: The publisher learns of the match a little after the subscription does.
+_SETTLE_S = 0.2
+_FINAL_WAIT_S = 0.5
+_CLOCK_FIELDS = struct.Struct("<iI")
+_CDR_HEAD_BYTES = 4
+
+
+def _spec(
+    name: str,
+    default: Value,
+    description: str,
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+) -> Spec:
+    return Spec(name, default, description, low, high, choices, change=Change.NEVER)
+
+
+#: What stands in the bag's custom metadata about a file of the drive: its name and SHA-256.
+_IDENTIFIED_FILES = ("policy", "vehicle")
+
+PARAMETERS = (
+    _spec("output", "", "Folder of the bag to create; empty: rosbag2_<date and time> in the working directory."),
+    _spec("topics", DEFAULT_TOPICS, "Topics to record; relative names honour namespace and remaps."),
+    _spec("regex", "", "Regular expression; every topic whose full name matches it is recorded, too."),
+    _spec("wait_for", DEFAULT_WAIT_FOR, "Topics that must be matched before ~/ready says true."),
+    _spec("record", True, "Begin to record at once; false: wait for ~/start."),
+    _spec("compression", "zstd", "Compression of the chunks.", choices=COMPRESSIONS),
+    _spec("chunk_bytes", 786_432, "Uncompressed size at which a chunk is written, bytes.", 1024, 64 * _MEBIBYTE),
+    _spec("flush_period_s", 0.5, "Longest time a message is in memory only, s.", 0.05, 60.0),
+    _spec("sync", True, "Wait at each flush until the disk has the data, so that a power cut loses no more."),
+    _spec("max_bytes", 0, "Size at which the next file of the bag begins, bytes; 0: never.", 0, 2**62),
+    _spec("max_duration_s", 0.0, "Time after which the next file of the bag begins, s; 0: never.", 0.0, 1e9),
+    _spec("max_message_bytes", 64 * _MEBIBYTE, "A larger message is dropped and counted, bytes.", 1, 2**31),
+    _spec("queue_bytes", 64 * _MEBIBYTE, "Memory for messages that wait to be written, bytes.", 1024, 2**40),
+    _spec("depth", 2000, "Messages each subscription keeps until they are taken.", 1, 100_000),
+    _spec("poll_period_s", 0.02, "Time between two rounds of taking messages, s.", 0.001, 0.2),
+    _spec("snapshot_s", 0.0, "Time span kept in memory for ~/snapshot, s; 0: none.", 0.0, 3600.0),
+    _spec("snapshot_bytes", 64 * _MEBIBYTE, "Memory for the snapshot, bytes; the oldest go first.", 1024, 2**40),
+    _spec("exit_on_error", True, "End with an error when recording fails; false: stay and report."),
+    _spec("policy_file", "", "Policy of the drive; its name and SHA-256 go into the bag's metadata."),
+    _spec("vehicle_file", "", "Vehicle of the drive; its name and SHA-256 go into the bag's metadata."),
+    _spec("metadata", [""], "More custom metadata of the bag, each as key=value."),
+)
+
+
+class Recorder(Node):
+    """The node: parameters, discovery, services and status around a `Recording`.
+
+    Raises
+    ------
+    IwmError
+        A parameter is wrong, or the bag cannot be created.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("recorder")
+        self._leave_clock_to_the_recording()
+        values = declare(self, PARAMETERS)
+        self._wait_for = [self.resolve_topic_name(name) for name in values["wait_for"] if name]
+        self._poll_s = values["poll_period_s"]
+        self._exit_on_error = values["exit_on_error"]
+        self._clock_topic = -1
+        self._now_ns: int | None = None
+        self._held: list[Taken] = []
+        self._raw = RawSubscriptions(
+            self,
+            [self.resolve_topic_name(name) for name in values["topics"] if name],
+            _pattern(values["regex"]),
+            values["depth"],
+        )
+        path = Path(values["output"] or datetime.now().strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
+        self.recording = Recording(path, _options(values), _custom_data(values))
+        if values["record"]:
+            self.recording.start()
+
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._ready_publisher = self.create_publisher(Bool, "~/ready", latched)
+        self._diagnostics = self.create_publisher(DiagnosticArray, DIAGNOSTICS, 1)
+        self.create_service(Trigger, "~/start", self._service(self.recording.start))
+        self.create_service(Trigger, "~/stop", self._service(self.recording.stop))
+        self.create_service(Trigger, "~/split", self._service(self.recording.split))
+        self.create_service(Trigger, "~/snapshot", self._service(self.recording.snapshot))
+        # Wall time: the status must come whether simulated time runs or not.
+        self.create_timer(_STATUS_PERIOD_S, self._publish_status, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._ready = False
+        self._matched_since: float | None = None
+        self._ready_publisher.publish(Bool(data=False))
+
+    # --- main loop --------------------------------------------------------------------------------------------------
+
+    def run(self, stop: threading.Event) -> None:
+        """Discover and take until `stop` is set or recording has failed."""
+        next_discovery = 0.0
+        while not stop.wait(self._poll_s):
+            now = time.monotonic()
+            if now >= next_discovery:
+                self._discover(now)
+                next_discovery = now + (_DISCOVERY_SLOW_S if self._ready else _DISCOVERY_FAST_S)
+            self._take()
+            if self._exit_on_error and self.recording.failed.is_set():
+                break
+
+    def finish(self) -> None:
+        """Take what still arrives, close the bag; `BagError` if recording had failed or fails now."""
+        deadline = time.monotonic() + _FINAL_WAIT_S
+        while self._take() and time.monotonic() < deadline:
+            time.sleep(self._poll_s)
+        if self._held:
+            # No /clock ever came: all messages keep the time they were received.
+            self.recording.put(self._held)
+        self.recording.close()
+        status = self.recording.status()
+        if self.recording.failed.is_set():
+            raise BagError(f"{status.error}; {status.dropped_error} messages were not recorded")
+        lost = sum(lost for _, lost, _ in self._raw.counts().values())
+        dropped = status.dropped_queue + status.dropped_size
+        self.get_logger().info(
+            f"{status.path or 'no bag'}: {status.written} messages, {status.bytes_on_disk / 1e6:.1f} MB, "
+            f"{status.files} file(s); dropped {dropped}, lost on the way {lost}"
+        )
+
+    def _discover(self, now: float) -> None:
+        found, problems = self._raw.discover()
+        for line in problems:
+            self.get_logger().warning(line)
+        for topic in found:
+            try:
+                definition, type_hash = definition_of(topic.type)
+            except BagError as error:
+                self.get_logger().warning(f"{topic.name}: recorded without a definition: {error}")
+                definition, type_hash = "", topic.type_hash
+            number = self.recording.add_topic(
+                Topic(topic.name, topic.type, definition, topic.type_hash or type_hash, topic.offered)
+            )
+            if number != topic.number:
+                raise AssertionError("topics are announced in the order they are found")
+            if topic.name == CLOCK:
+                self._clock_topic = number
+        self._update_ready(now)
+
+    def _update_ready(self, now: float) -> None:
+        if not self._raw.matched(self._wait_for):
+            self._matched_since = None
+        elif self._matched_since is None:
+            self._matched_since = now
+        ready = self._matched_since is not None and now - self._matched_since >= _SETTLE_S
+        if ready != self._ready:
+            self._ready = ready
+            self._ready_publisher.publish(Bool(data=ready))
+            self.get_logger().info("ready" if ready else "a topic has lost its publisher")
+
+    def _take(self) -> bool:
+        batch = self._raw.take()
+        if not batch:
+            return False
+        self.recording.put(self._at_simulated_time(batch) if self._use_sim_time else batch)
+        return True
+
+    def _at_simulated_time(self, batch: list[Taken]) -> list[Sample]:
+        """The batch with the time /clock showed when each message arrived.
+
+        What comes before the first /clock is kept until then and gets its time: time had not begun.
+        """
+        samples: list[Sample] = []
+        for taken in batch:
+            number, _, data, sent, sequence = taken
+            if number == self._clock_topic and len(data) >= _CDR_HEAD_BYTES + _CLOCK_FIELDS.size:
+                seconds, nanoseconds = _CLOCK_FIELDS.unpack_from(data, _CDR_HEAD_BYTES)
+                self._now_ns = seconds * 1_000_000_000 + nanoseconds
+            if self._now_ns is None:
+                self._held.append(taken)
+                continue
+            if self._held:
+                samples += [(held[0], self._now_ns, *held[2:]) for held in self._held]
+                self._held = []
+            samples.append((number, self._now_ns, data, sent, sequence))
+        return samples
+
+    def _leave_clock_to_the_recording(self) -> None:
+        """With use_sim_time rclpy would decode every /clock for a node clock that nothing here reads."""
+        self._use_sim_time = bool(self.get_parameter("use_sim_time").value)
+        for subscription in list(self.subscriptions):
+            if subscription.topic_name == CLOCK:
+                self.destroy_subscription(subscription)
+
+    # --- services and status ----------------------------------------------------------------------------------------
+
+    def _service(self, command: Callable[[], Path]) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
+        def handle(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.message = str(command())
+                response.success = True
+            except BagError as error:
+                response.message = str(error)
+                response.success = False
+            return response
+
+        return handle
+
+    def _publish_status(self) -> None:
+        status = self.recording.status()
+        counts = self._raw.counts()
+        lost = sum(lost for _, lost, _ in counts.values())
+        dropped = status.dropped_queue + status.dropped_size + status.dropped_error
+        if status.state == FAILED:
+            level, text = DiagnosticStatus.ERROR, status.error
+        elif dropped or lost:
+            level, text = DiagnosticStatus.WARN, f"{status.state}; {dropped} dropped, {lost} lost on the way"
+        elif self._use_sim_time and self._now_ns is None:
+            level, text = DiagnosticStatus.WARN, f"{status.state}; waiting for {CLOCK}"
+        else:
+            level, text = DiagnosticStatus.OK, status.state
+        values = {**status._asdict(), "lost": lost, "topics": len(counts), "ready": self._ready}
+        for name, (taken, missing, missed) in counts.items():
+            values[name] = f"{taken} taken, {missing} lost, {missed} before the first"
+        message = DiagnosticArray()
+        now_ns = self._now_ns if self._use_sim_time else time.time_ns()
+        message.header.stamp = ns_to_stamp(now_ns or 0)
+        message.status = [
+            DiagnosticStatus(
+                level=level,
+                name=f"{self.get_name()}: recording",
+                message=text,
+                hardware_id="",
+                values=[KeyValue(key=str(key), value=str(value)) for key, value in values.items()],
+            )
+        ]
+        self._diagnostics.publish(message)
+
+
+def _pattern(text: str) -> re.Pattern[str] | None:
+    try:
+        return re.compile(text) if text else None
+    except re.error as error:
+        raise ParameterError(f"parameter regex: {text!r} is no regular expression: {error}") from None
+
+
+def _options(values: Mapping[str, Any]) -> RecordingOptions:
+    return RecordingOptions(
+        writer=WriterOptions(
+            compression=values["compression"],
+            chunk_bytes=values["chunk_bytes"],
+            max_bytes=values["max_bytes"],
+            max_duration_ns=int(values["max_duration_s"] * 1e9),
+            max_message_bytes=values["max_message_bytes"],
+        ),
+        flush_period_s=values["flush_period_s"],
+        sync=values["sync"],
+        queue_bytes=values["queue_bytes"],
+        snapshot_s=values["snapshot_s"],
+        snapshot_bytes=values["snapshot_bytes"],
+    )
+
+
+def _custom_data(values: Mapping[str, Any]) -> dict[str, str]:
+    custom = {"package_version": __version__}
+    for kind in _IDENTIFIED_FILES:
+        name = values[f"{kind}_file"]
+        if name:
+            custom[f"{kind}_file"] = Path(name).name
+            custom[f"{kind}_sha256"] = sha256_of(name)
+    for pair in filter(None, values["metadata"]):
+        key, _, value = pair.partition("=")
+        if not (key and value):
+            raise ParameterError(f"parameter metadata: {pair!r} is not allowed; allowed: key=value")
+        custom[key] = value
+    return custom
+
+
+def _spin(executor: SingleThreadedExecutor) -> None:
+    with suppress(ExternalShutdownException):
+        executor.spin()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node until Ctrl-C or SIGTERM; returns the exit code."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        # rclpy's own handlers would close DDS before the last messages are taken.
+        rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # rcl's only word for a wrong --ros-args
+        print(f"recorder: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    try:
+        return _record(stop)
+    except IwmError as error:
+        print(f"recorder: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    finally:
+        rclpy.try_shutdown()
+
+
+def _record(stop: threading.Event) -> int:
+    node = Recorder()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    spinning = threading.Thread(target=_spin, args=(executor,), name="executor", daemon=True)
+    spinning.start()
+    try:
+        node.run(stop)
+        node.finish()
+    finally:
+        executor.shutdown()
+        spinning.join()
+        node.destroy_node()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
