@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
+
+from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
+from iwm_power_manager.control.monitor import select_by_name as select_by_name  # part of this interface
 
 #: Default names of the wheels, in the order used everywhere (`control.types.Wheels`).
 WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
@@ -50,39 +52,6 @@ TOPIC_TYPES: dict[str, type] = {
 
 _NANOSECONDS = 1_000_000_000
 
-
-class SpeedReading(NamedTuple):
-    """`vehicle_speed` as numbers."""
-
-    stamp_ns: int
-    speed_mps: float
-
-
-class JointReading(NamedTuple):
-    """A JointState as numbers: one of its value fields, with the names it came with."""
-
-    stamp_ns: int
-    names: tuple[str, ...]
-    values: tuple[float, ...]
-
-
-class BatteryReading(NamedTuple):
-    """`battery_state` as numbers. `soc` and `temperature_c` are single precision, as the message carries them.
-
-    Attributes
-    ----------
-    stamp_ns : time of the measurement
-    soc : state of charge, 0..1 (NaN: not measured)
-    temperature_c : pack temperature (NaN: not measured)
-    voltage_v : terminal voltage
-    discharge_current_a : positive when discharging
-    """
-
-    stamp_ns: int
-    soc: float
-    temperature_c: float
-    voltage_v: float
-    discharge_current_a: float
 
 
 def stamp_to_ns(stamp: Time) -> int:
@@ -212,13 +181,3 @@ def named_numbers_message(stamp_ns: int, names: Sequence[str], values: Sequence[
 def read_named_numbers(message: JointState) -> tuple[int, dict[str, float]]:
     """Stamp (ns) and values by name of a message made by `named_numbers_message`."""
     return stamp_to_ns(message.header.stamp), dict(zip(message.name, message.position, strict=True))
-
-
-def select_by_name(reading: JointReading, wanted: Sequence[str]) -> tuple[float, ...]:
-    """Values of a JointState in the order of `wanted`; NaN where a name is absent, doubled, or has no value."""
-    if len(reading.names) != len(reading.values):
-        return (math.nan,) * len(wanted)
-    if reading.names == tuple(wanted):
-        return reading.values
-    found = dict(zip(reading.names, reading.values, strict=True))
-    return tuple(found[name] if reading.names.count(name) == 1 else math.nan for name in wanted)

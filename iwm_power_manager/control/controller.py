@@ -1,0 +1,152 @@
+"""The power manager without ROS: inputs in, one step out.
+
+Holds what lives from step to step (latest inputs, degraded state, the law's memory) and does one thing: turn them into
+a command that is finite and inside every limit. The node adds DDS, the clock and the lifecycle; tests and replays use
+this class as it is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from iwm_power_manager.actuation.limits import battery_limits_w
+from iwm_power_manager.control import law
+from iwm_power_manager.control.guard import violated_bound
+from iwm_power_manager.control.inputs import WheelVerdict
+from iwm_power_manager.control.monitor import InputLimits, InputMonitor
+from iwm_power_manager.control.record import Watch, to_numbers
+from iwm_power_manager.control.supervision import (
+    LOCKSTEP_SUPERVISION,
+    STALE_SPEED,
+    STALE_WHEELS,
+    Supervision,
+    SupervisionLimits,
+    shape_demand,
+    stale_inputs,
+    supervise,
+)
+from iwm_power_manager.control.types import Command, Measurement, Settings, initial_state
+from iwm_power_manager.policy import PolicyTable
+from iwm_power_manager.vehicle import VehicleParams
+
+#: While a wheel is lost, slip is judged this much more strictly: its axle is watched through one wheel only.
+LOST_WHEEL_SLIP_FACTOR = 0.5
+
+
+class ControlFaultError(RuntimeError):
+    """The law returned something no motor may be given."""
+
+
+class ControllerLimits(NamedTuple):
+    """What the controller judges by.
+
+    Attributes
+    ----------
+    inputs : checks of every message
+    age_s : ages at which speed, wheels, demand and battery are missing; None in lock-step, where nothing can be missing
+    supervision : times of the degraded state
+    """
+
+    inputs: InputLimits
+    age_s: tuple[float, float, float, float] | None
+    supervision: SupervisionLimits
+
+
+class Step(NamedTuple):
+    """One step: what to command, and the numbers of `record.SIGNALS`."""
+
+    command: Command
+    values: list[float]
+
+
+class Controller:
+    """Inputs in, one step out.
+
+    Attributes
+    ----------
+    monitor : takes the readings
+    supervision : degraded state after the last step
+    settings, policy, friction : may be replaced between steps; torque follows through the law's own rate limits
+    command : last command
+    """
+
+    def __init__(
+        self,
+        vehicle: VehicleParams,
+        wheel_names: tuple[str, ...],
+        limits: ControllerLimits,
+        settings: Settings,
+        policy: PolicyTable,
+        friction: float,
+    ) -> None:
+        self._vehicle = vehicle
+        self._limits = limits
+        self.monitor = InputMonitor(wheel_names, limits.inputs)
+        self.settings = settings
+        self.policy = policy
+        self.friction = friction
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget inputs and memory, as at activation."""
+        self.monitor.forget()
+        self.supervision = Supervision() if self._limits.age_s else LOCKSTEP_SUPERVISION
+        self.state = initial_state()
+        self.command: Command | None = None
+
+    @property
+    def wheels_lost(self) -> int:
+        """Bits of the wheels that are not believed."""
+        return sum(1 << i for i, verdict in enumerate(self.monitor.verdicts) if verdict is not WheelVerdict.GOOD)
+
+    def step(self, now_ns: int, dt_s: float) -> Step:
+        """One control step at a time, `dt_s` after the previous one.
+
+        Raises
+        ------
+        ControlFaultError
+            The law returned a command that is not finite or beyond what the motors and brakes can do. Nothing of it may
+            be sent.
+        """
+        age_s = self.monitor.ages_s(now_ns)
+        if self._limits.age_s:
+            stale = stale_inputs(age_s, self._limits.age_s)
+            self.supervision = supervise(self.supervision, stale, dt_s, self._limits.supervision)
+        measurement = self._measurement(dt_s)
+        settings = self._settings()
+        command, after = law.step(measurement, self.state, settings, self._vehicle, self.policy)
+        problem = violated_bound(command, self._vehicle)
+        if problem:
+            raise ControlFaultError(problem)
+        watch = Watch(self.wheels_lost, self.monitor.demand_w, age_s)
+        values = to_numbers(measurement, settings, command, self.state, after, self.supervision, watch)
+        self.state = after
+        self.command = command
+        return Step(command, values)
+
+    def _measurement(self, dt_s: float) -> Measurement:
+        monitor, supervision = self.monitor, self.supervision
+        speed = monitor.speed_mps
+        wheels = monitor.wheel_speed_radps
+        radius = self._vehicle.wheel.radius_m
+        if supervision.stale & STALE_SPEED and not supervision.stale & STALE_WHEELS:
+            # The wheel that slips least tells the speed best.
+            speed = max(radius * (max(wheels) if monitor.demand_w < 0.0 else min(wheels)), 0.0)
+        elif supervision.stale & STALE_WHEELS and not supervision.stale & STALE_SPEED:
+            wheels = (speed / radius,) * 4
+        demand = shape_demand(monitor.demand_w, monitor.demand_speed_mps, speed, supervision)
+        discharge, charge = battery_limits_w(monitor.soc, monitor.temperature_c, self._vehicle.battery)
+        factor = supervision.motor_factor
+        return Measurement(
+            speed, wheels, demand, dt_s, self.friction, discharge * factor, charge * factor, monitor.soc
+        )
+
+    def _settings(self) -> Settings:
+        if not self.wheels_lost:
+            return self.settings
+        settings, factor = self.settings, LOST_WHEEL_SLIP_FACTOR
+        return settings._replace(
+            critical_slip=settings.critical_slip * factor,
+            slip_target=settings.slip_target * factor,
+            gate_hysteresis=settings.gate_hysteresis * factor,
+        )

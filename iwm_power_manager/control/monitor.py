@@ -1,0 +1,272 @@
+"""The latest accepted input of each topic, with its age and its counters.
+
+Takes readings, which are messages turned into numbers, judges them with `control.inputs`, keeps what is good and counts
+what is not. It knows no ROS object, so that the node, the replay and the tests use the same code.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from iwm_power_manager.control.inputs import (
+    NEW_WHEELS,
+    StampLimits,
+    ValueLimits,
+    Violation,
+    WheelLimits,
+    WheelVerdict,
+    check_names,
+    check_stamp,
+    check_value,
+    judge_wheels,
+)
+from iwm_power_manager.control.types import Wheels
+
+SPEED = "vehicle_speed"
+WHEELS = "wheel_states"
+DEMAND = "power_demand"
+BATTERY = "battery_state"
+FRICTION = "road_friction"
+
+_NS_PER_S = 1e9
+
+
+class SpeedReading(NamedTuple):
+    """`vehicle_speed` as numbers."""
+
+    stamp_ns: int
+    speed_mps: float
+
+
+class JointReading(NamedTuple):
+    """A JointState as numbers: one of its value fields, with the names it came with."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+
+
+class BatteryReading(NamedTuple):
+    """`battery_state` as numbers. `soc` and `temperature_c` are single precision, as the message carries them.
+
+    Attributes
+    ----------
+    stamp_ns : time of the measurement
+    soc : state of charge, 0..1 (NaN: not measured)
+    temperature_c : pack temperature (NaN: not measured)
+    voltage_v : terminal voltage
+    discharge_current_a : positive when discharging
+    """
+
+    stamp_ns: int
+    soc: float
+    temperature_c: float
+    voltage_v: float
+    discharge_current_a: float
+
+
+def select_by_name(reading: JointReading, wanted: Sequence[str]) -> tuple[float, ...]:
+    """Values of a JointState in the order of `wanted`; NaN where a name is absent, doubled, or has no value."""
+    if len(reading.names) != len(reading.values):
+        return (math.nan,) * len(wanted)
+    if reading.names == tuple(wanted):
+        return reading.values
+    found = dict(zip(reading.names, reading.values, strict=True))
+    return tuple(found[name] if reading.names.count(name) == 1 else math.nan for name in wanted)
+
+
+class InputLimits(NamedTuple):
+    """Everything an input is judged by.
+
+    Attributes
+    ----------
+    stamp : of `vehicle_speed`, `wheel_states` and `battery_state`; None does not judge stamps (lock-step)
+    demand_delay_s : longest time between sending and receiving a power demand, which carries no stamp
+    speed, demand, soc, temperature, friction : range and rates
+    wheels : see `WheelLimits`
+    radius_m : rolling radius
+    """
+
+    stamp: StampLimits | None
+    demand_delay_s: float
+    speed: ValueLimits
+    demand: ValueLimits
+    soc: ValueLimits
+    temperature: ValueLimits
+    friction: ValueLimits
+    wheels: WheelLimits
+    radius_m: float
+
+
+@dataclass
+class Tally:
+    """What became of the messages of one topic.
+
+    Attributes
+    ----------
+    received : all messages
+    dropped : by reason
+    accepted_ns : time of the last accepted one: its stamp, or when it was received if it has none (None: none yet)
+    violation : why the last message was dropped, or was accepted with a reservation
+    """
+
+    received: int = 0
+    dropped: Counter[Violation] = field(default_factory=Counter)
+    accepted_ns: int | None = None
+    violation: Violation = Violation.NONE
+
+    def age_s(self, now_ns: int) -> float:
+        """Time since the last accepted message; infinite before the first."""
+        return math.inf if self.accepted_ns is None else max(now_ns - self.accepted_ns, 0) / _NS_PER_S
+
+    def note(self, violation: Violation, time_ns: int) -> bool:
+        """Count a message; True if it may be used."""
+        self.received += 1
+        self.violation = violation
+        if violation is Violation.NONE:
+            self.accepted_ns = time_ns
+            return True
+        self.dropped[violation] += 1
+        return False
+
+
+class InputMonitor:
+    """Latest good inputs.
+
+    Attributes
+    ----------
+    speed_mps, wheel_speed_radps, demand_w, soc, temperature_c, friction : last accepted values
+    demand_speed_mps : speed of the car when the last demand was accepted
+    verdicts : what was wrong with each wheel in the last `wheel_states`
+    tallies : counters by topic
+    """
+
+    def __init__(self, wheel_names: tuple[str, ...], limits: InputLimits) -> None:
+        self._wheel_names = wheel_names
+        self._limits = limits
+        self.tallies = {
+            topic: Tally()
+            for topic in (SPEED, WHEELS, DEMAND, BATTERY, FRICTION)
+        }
+        self.forget()
+
+    def forget(self) -> None:
+        """Start again without history, as at activation or after the clock jumped back; counters stay."""
+        self.speed_mps = 0.0
+        self.wheel_speed_radps: Wheels = (0.0, 0.0, 0.0, 0.0)
+        self.demand_w = 0.0
+        self.demand_speed_mps = 0.0
+        self.soc = 0.5
+        self.temperature_c = math.nan
+        self.friction = math.nan
+        self.verdicts = (WheelVerdict.GOOD,) * 4
+        self._wheel_memory = NEW_WHEELS
+        self._wheels_ns: int | None = None
+        for tally in self.tallies.values():
+            tally.accepted_ns = None
+
+    def ages_s(self, now_ns: int) -> tuple[float, float, float, float]:
+        """Ages of speed, wheels, demand and battery."""
+        tallies = self.tallies
+        return (
+            tallies[SPEED].age_s(now_ns),
+            tallies[WHEELS].age_s(now_ns),
+            tallies[DEMAND].age_s(now_ns),
+            tallies[BATTERY].age_s(now_ns),
+        )
+
+    @property
+    def complete(self) -> bool:
+        """Every input the law needs has been accepted once."""
+        return math.inf not in self.ages_s(0)
+
+    def take_speed(self, reading: SpeedReading, now_ns: int) -> bool:
+        """Judge `vehicle_speed`; True if it was accepted."""
+        tally = self.tallies[SPEED]
+        violation = self._check_stamp(tally, reading.stamp_ns, now_ns)
+        if violation is Violation.NONE:
+            last = math.nan if tally.accepted_ns is None else self.speed_mps
+            violation = check_value(reading.speed_mps, last, tally.age_s(reading.stamp_ns), self._limits.speed)
+        if tally.note(violation, reading.stamp_ns):
+            # Noise around standstill is not driving backwards.
+            self.speed_mps = max(reading.speed_mps, 0.0)
+            return True
+        return False
+
+    def take_wheels(self, reading: JointReading, now_ns: int) -> bool:
+        """Judge `wheel_states`; True if it was accepted.
+
+        A message that lacks a wheel is counted and reported, and still used for the others.
+        """
+        tally = self.tallies[WHEELS]
+        violation = self._check_stamp(tally, reading.stamp_ns, now_ns)
+        if violation is Violation.NONE:
+            violation = check_names(reading.names, len(reading.values), self._wheel_names)
+        if violation not in (Violation.NONE, Violation.NAME_MISSING):
+            return tally.note(violation, reading.stamp_ns)
+        elapsed_s = 0.0 if self._wheels_ns is None else max(reading.stamp_ns - self._wheels_ns, 0) / _NS_PER_S
+        self._wheels_ns = reading.stamp_ns
+        judged = judge_wheels(
+            select_by_name(reading, self._wheel_names),
+            self.speed_mps / self._limits.radius_m,
+            elapsed_s,
+            self._wheel_memory,
+            self._limits.wheels,
+            self._limits.radius_m,
+        )
+        self._wheel_memory = judged.memory
+        self.verdicts = judged.verdicts
+        if any(math.isnan(speed) for speed in judged.speed_radps):
+            return tally.note(Violation.AXLE_LOST, reading.stamp_ns)
+        self.wheel_speed_radps = judged.speed_radps
+        tally.note(Violation.NONE, reading.stamp_ns)
+        if violation is Violation.NAME_MISSING:
+            tally.violation = violation
+            tally.dropped[violation] += 1
+        return True
+
+    def take_demand(self, demand_w: float, delay_s: float, now_ns: int) -> bool:
+        """Judge `power_demand`, received `delay_s` after it was sent; True if it was accepted."""
+        tally = self.tallies[DEMAND]
+        violation = Violation.LATE if delay_s > self._limits.demand_delay_s else Violation.NONE
+        if violation is Violation.NONE:
+            last = math.nan if tally.accepted_ns is None else self.demand_w
+            violation = check_value(demand_w, last, tally.age_s(now_ns), self._limits.demand)
+        if tally.note(violation, now_ns):
+            self.demand_w = demand_w
+            self.demand_speed_mps = self.speed_mps
+            return True
+        return False
+
+    def take_battery(self, reading: BatteryReading, now_ns: int) -> bool:
+        """Judge `battery_state`; True if it was accepted. A temperature that is not measured (NaN) is allowed."""
+        tally = self.tallies[BATTERY]
+        violation = self._check_stamp(tally, reading.stamp_ns, now_ns)
+        first = tally.accepted_ns is None
+        elapsed_s = tally.age_s(reading.stamp_ns)
+        if violation is Violation.NONE:
+            violation = check_value(reading.soc, math.nan if first else self.soc, elapsed_s, self._limits.soc)
+        if violation is Violation.NONE and not math.isnan(reading.temperature_c):
+            violation = check_value(reading.temperature_c, self.temperature_c, elapsed_s, self._limits.temperature)
+        if tally.note(violation, reading.stamp_ns):
+            self.soc = reading.soc
+            self.temperature_c = reading.temperature_c
+            return True
+        return False
+
+    def take_friction(self, friction: float, now_ns: int) -> bool:
+        """Judge `road_friction`; True if it was accepted."""
+        tally = self.tallies[FRICTION]
+        if tally.note(check_value(friction, math.nan, 0.0, self._limits.friction), now_ns):
+            self.friction = friction
+            return True
+        return False
+
+    def _check_stamp(self, tally: Tally, stamp_ns: int, now_ns: int) -> Violation:
+        if self._limits.stamp is None:
+            return Violation.NONE
+        return check_stamp(stamp_ns, tally.accepted_ns, now_ns, self._limits.stamp)

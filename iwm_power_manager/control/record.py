@@ -1,0 +1,138 @@
+"""One control step as a flat list of named numbers: what `power_manager/state` carries and a replay reads.
+
+It holds everything the law took (measurement and settings) and decided, and why. A replay that feeds the recorded
+measurement and settings to the law again, starting from the initial state wherever `step` is 0, gets the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from iwm_power_manager.control.supervision import Supervision
+from iwm_power_manager.control.types import Command, ControllerState, Measurement, Settings
+
+_WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+_SETTING = "setting."
+
+
+class Signal(NamedTuple):
+    """One named number: its name, which ends in its unit, and what it means."""
+
+    name: str
+    meaning: str
+
+
+_MEASUREMENT = (
+    Signal("speed_mps", "vehicle speed the law used"),
+    *(Signal(f"{wheel}_speed_radps", "wheel speed the law used; a lost wheel has its axle partner's") for wheel in _WHEELS),
+    Signal("power_demand_w", "power demand the law used: after the ramps of the degraded state"),
+    Signal("dt_s", "time since the previous step"),
+    Signal("friction", "peak friction coefficient the strategy assumed"),
+    Signal("discharge_limit_w", "electrical power the battery may give"),
+    Signal("charge_limit_w", "electrical power the battery may take"),
+    Signal("soc", "state of charge, 0..1"),
+)
+_COMMAND = (
+    *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in _WHEELS),
+    *(Signal(f"{wheel}_friction_torque_nm", "commanded friction brake torque, <= 0") for wheel in _WHEELS),
+    Signal("front_share", "front axle's part of the power demand as applied, 0..1"),
+    Signal("decided_share", "front share the strategy decided on, 0..1"),
+    Signal("gate", "axles held at zero torque: 0 none, 1 front, 2 rear, 3 both"),
+    Signal("limits", "bits of the limits that bind: 1 motor, 2 regeneration, 4 battery discharge, 8 battery charge, "
+           "16 thermal, 32 slew, 64 slip limiter, 128 friction brake"),
+    Signal("front_power_w", "power of the front axle's command"),
+    Signal("rear_power_w", "power of the rear axle's command"),
+    Signal("front_slip", "filtered slip of the front axle"),
+    Signal("rear_slip", "filtered slip of the rear axle"),
+)
+_CONTROLLER = (
+    Signal("step", "steps since the law's initial state; 0 is the first"),
+    Signal("front_heat", "heat index of the front motors, 0 cold to 1 hot"),
+    Signal("rear_heat", "heat index of the rear motors, 0 cold to 1 hot"),
+)
+_SUPERVISION = (
+    Signal("mode", "0 waiting, 1 normal, 2 degraded, 3 recovering"),
+    Signal("stale", "bits of the missing inputs: 1 vehicle_speed, 2 wheel_states, 4 power_demand, 8 battery_state"),
+    Signal("motor_factor", "part of the motor torque that is allowed, 0..1"),
+    Signal("brake_factor", "part of a stale braking force that is still held, 0..1"),
+    Signal("wheels_lost", "bits of the wheels that are not believed: 1, 2, 4, 8 in the order of the wheels"),
+    Signal("requested_power_w", "last accepted power demand, before the ramps"),
+    Signal("vehicle_speed_age_s", "age of the speed"),
+    Signal("wheel_states_age_s", "age of the wheel speeds"),
+    Signal("power_demand_age_s", "age of the power demand"),
+    Signal("battery_state_age_s", "age of the battery's state"),
+)
+_SETTINGS = tuple(Signal(_SETTING + name, "the law's setting of that name") for name in Settings._fields)
+
+#: All signals, in the order in which they are published.
+SIGNALS = (*_MEASUREMENT, *_COMMAND, *_CONTROLLER, *_SUPERVISION, *_SETTINGS)
+SIGNAL_NAMES = [signal.name for signal in SIGNALS]
+
+
+class Watch(NamedTuple):
+    """What the node knows beside the law's own numbers.
+
+    Attributes
+    ----------
+    wheels_lost : bits of the wheels that are not believed
+    requested_power_w : power demand before the ramps
+    age_s : ages of speed, wheels, demand, battery
+    """
+
+    wheels_lost: int
+    requested_power_w: float
+    age_s: tuple[float, float, float, float]
+
+
+def to_numbers(
+    measurement: Measurement,
+    settings: Settings,
+    command: Command,
+    before: ControllerState,
+    after: ControllerState,
+    supervision: Supervision,
+    watch: Watch,
+) -> list[float]:
+    """Values of `SIGNALS` for one step; `before` and `after` are the law's memory."""
+    return [
+        measurement.speed_mps,
+        *measurement.wheel_speed_radps,
+        *measurement[2:],
+        *command.motor_torque_nm,
+        *command.friction_torque_nm,
+        *command[2:],
+        before.steps,
+        after.front_heat,
+        after.rear_heat,
+        *supervision[:4],
+        watch.wheels_lost,
+        watch.requested_power_w,
+        *watch.age_s,
+        *settings,
+    ]
+
+
+class RecordedStep(NamedTuple):
+    """What a replay needs of a recorded step."""
+
+    first: bool
+    measurement: Measurement
+    settings: Settings
+
+
+def from_numbers(values: Mapping[str, float]) -> RecordedStep:
+    """The inverse of `to_numbers`, as far as the law's inputs go.
+
+    Raises
+    ------
+    KeyError
+        A signal is missing: the record was not made by this project, or by another version of it.
+    """
+    taken = [float(values[signal.name]) for signal in _MEASUREMENT]
+    measurement = Measurement(taken[0], (taken[1], taken[2], taken[3], taken[4]), *taken[5:])
+    # Integers and flags travel as numbers; the law has to get back the types it was compiled for.
+    kinds = Settings.__annotations__
+    convert = {"int": int, "bool": bool, "float": float}
+    settings = Settings(*(convert[kinds[name]](values[_SETTING + name]) for name in Settings._fields))
+    return RecordedStep(values["step"] == 0.0, measurement, settings)

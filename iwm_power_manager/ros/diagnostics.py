@@ -1,0 +1,199 @@
+"""What `/diagnostics` says: levels, messages and values from plain numbers, and the loop's supervision.
+
+The stamp is the node's clock, so that it is right under sim time; rates are per second of that clock as well.
+Execution time is measured on the processor's own clock: it is real whatever the simulated time does.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+from iwm_power_manager.control.inputs import Violation, WheelVerdict
+from iwm_power_manager.control.monitor import Tally
+from iwm_power_manager.control.supervision import MODE_NAMES, MODE_NORMAL, STALE_NAMES, Supervision
+from iwm_power_manager.control.types import GATE_NAMES, LIMIT_NAMES
+from iwm_power_manager.ros.messages import ns_to_stamp
+
+OK, WARN, ERROR, STALE = range(4)
+_LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE)
+
+
+class Status(NamedTuple):
+    """One component's state, as `diagnostic_msgs/DiagnosticStatus` has it."""
+
+    name: str
+    level: int
+    message: str
+    values: Mapping[str, str]
+
+
+def to_message(stamp_ns: int, node_name: str, statuses: Sequence[Status]) -> DiagnosticArray:
+    """All statuses of a node as one message."""
+    message = DiagnosticArray()
+    message.header.stamp = ns_to_stamp(stamp_ns)
+    for status in statuses:
+        message.status.append(
+            DiagnosticStatus(
+                level=_LEVELS[status.level],
+                name=f"{node_name}: {status.name}",
+                message=status.message,
+                hardware_id=node_name,
+                values=[KeyValue(key=key, value=value) for key, value in status.values.items()],
+            )
+        )
+    return message
+
+
+@dataclass
+class LoopStatistics:
+    """Periods and execution times since the last report.
+
+    Attributes
+    ----------
+    steps : steps since the node became active
+    """
+
+    steps: int = 0
+    _count: int = 0
+    _periods: int = 0
+    _period_sum_s: float = 0.0
+    _period_max_s: float = 0.0
+    _period_min_s: float = math.inf
+    _execution_sum_s: float = 0.0
+    _execution_max_s: float = 0.0
+
+    def add(self, period_s: float | None, execution_s: float) -> None:
+        """Count a step; `period_s` is None where there is no previous step."""
+        self.steps += 1
+        self._count += 1
+        self._execution_sum_s += execution_s
+        self._execution_max_s = max(self._execution_max_s, execution_s)
+        if period_s is not None:
+            self._periods += 1
+            self._period_sum_s += period_s
+            self._period_max_s = max(self._period_max_s, period_s)
+            self._period_min_s = min(self._period_min_s, period_s)
+
+    def report(self, rate_hz: float | None, limits: Mapping[str, float]) -> Status:
+        """State of the control loop since the last call, judged as ros2_control does; starts counting anew.
+
+        Parameters
+        ----------
+        rate_hz : the rate that was asked for; None in lock-step, where there is none
+        limits : execution_warn_us, execution_error_us, periodicity_warn_hz, periodicity_error_hz
+        """
+        problems: list[tuple[int, str]] = []
+        values = {"steps": str(self.steps), "steps since the last report": str(self._count)}
+        if self._count:
+            mean_us = self._execution_sum_s / self._count * 1e6
+            values["execution time, mean (us)"] = f"{mean_us:.0f}"
+            values["execution time, max (us)"] = f"{self._execution_max_s * 1e6:.0f}"
+            problems += _beyond(mean_us, limits, "execution", "us", "mean execution time")
+        if self._periods and self._period_sum_s > 0.0:
+            mean_hz = self._periods / self._period_sum_s
+            values["rate, mean (Hz)"] = f"{mean_hz:.2f}"
+            values["period, min (ms)"] = f"{self._period_min_s * 1e3:.3f}"
+            values["period, max (ms)"] = f"{self._period_max_s * 1e3:.3f}"
+            if rate_hz is not None:
+                problems += _beyond(abs(mean_hz - rate_hz), limits, "periodicity", "hz", f"deviation from {rate_hz:g} Hz")
+        elif rate_hz is not None:
+            problems.append((ERROR, "no step since the last report"))
+        steps = self.steps
+        self.__init__()  # type: ignore[misc]
+        self.steps = steps
+        level, message = _worst(problems)
+        return Status("control loop", level, message, values)
+
+
+def _beyond(value: float, limits: Mapping[str, float], what: str, unit: str, text: str) -> list[tuple[int, str]]:
+    for level, word in ((ERROR, "error"), (WARN, "warn")):
+        limit = limits[f"{what}_{word}_{unit}"]
+        if value > limit:
+            return [(level, f"{text} {value:.0f} {unit} is above {limit:g}")]
+    return []
+
+
+def _worst(problems: Sequence[tuple[int, str]]) -> tuple[int, str]:
+    if not problems:
+        return OK, "ok"
+    return max(level for level, _ in problems), "; ".join(text for _, text in problems)
+
+
+@dataclass
+class InputReport:
+    """State of the inputs; remembers the counts of the last report to tell rates."""
+
+    _received: dict[str, int] = field(default_factory=dict)
+    _dropped: dict[str, int] = field(default_factory=dict)
+    _last_ns: int | None = None
+
+    def report(
+        self,
+        now_ns: int,
+        tallies: Mapping[str, Tally],
+        stale: int,
+        verdicts: Sequence[WheelVerdict],
+        wheel_names: Sequence[str],
+    ) -> Status:
+        """Ages, rates, counters and reasons of all inputs."""
+        problems: list[tuple[int, str]] = []
+        values = {}
+        elapsed_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) / 1e9
+        missing = {name for bit, name in STALE_NAMES.items() if stale & bit}
+        for topic, tally in tallies.items():
+            dropped = sum(tally.dropped.values())
+            values[f"{topic}: age (s)"] = f"{tally.age_s(now_ns):.3f}"
+            if elapsed_s > 0.0:
+                rate = (tally.received - self._received.get(topic, 0)) / elapsed_s
+                values[f"{topic}: rate (Hz)"] = f"{rate:.1f}"
+            values[f"{topic}: received"] = str(tally.received)
+            values[f"{topic}: dropped"] = str(dropped)
+            for reason, count in sorted(tally.dropped.items()):
+                values[f"{topic}: dropped, {_words(reason)}"] = str(count)
+            if topic in missing:
+                reason = f" ({_words(tally.violation)})" if tally.violation is not Violation.NONE else ""
+                problems.append((ERROR, f"{topic} is missing{reason}"))
+            elif dropped > self._dropped.get(topic, 0):
+                problems.append((WARN, f"{topic}: {_words(tally.violation)}" if tally.violation else f"{topic}: dropped"))
+            self._received[topic], self._dropped[topic] = tally.received, dropped
+        for name, verdict in zip(wheel_names, verdicts, strict=True):
+            values[f"wheel {name}"] = _words(verdict)
+            if verdict is not WheelVerdict.GOOD:
+                problems.append((WARN, f"wheel {name} is not believed ({_words(verdict)})"))
+        self._last_ns = now_ns
+        level, message = _worst(problems)
+        return Status("inputs", level, message, values)
+
+
+def control_status(
+    lifecycle: str, supervision: Supervision, gate: int, limits: int, activity: Mapping[str, int], strategy: str
+) -> Status:
+    """What the control does: lifecycle state, mode and its reason, gate, limits that bind, how often they did."""
+    mode = MODE_NAMES[supervision.mode]
+    missing = [name for bit, name in STALE_NAMES.items() if supervision.stale & bit]
+    binding = [name for bit, name in LIMIT_NAMES.items() if limits & bit]
+    values = {
+        "lifecycle": lifecycle,
+        "mode": mode,
+        "degraded reason": f"missing: {', '.join(missing)}" if missing else "none",
+        "motor torque allowed (%)": f"{100.0 * supervision.motor_factor:.0f}",
+        "strategy": strategy,
+        "gate": GATE_NAMES[gate],
+        "limits that bind": ", ".join(binding) or "none",
+        **{f"{name}: steps since the last report": str(count) for name, count in activity.items()},
+    }
+    if lifecycle != "active":
+        return Status("control", OK, lifecycle, values)
+    if supervision.mode == MODE_NORMAL:
+        return Status("control", OK, "normal", values)
+    reason = f": {', '.join(missing)} missing" if missing else ""
+    return Status("control", ERROR if missing else WARN, f"{mode}{reason}", values)
+
+
+def _words(code: Violation | WheelVerdict) -> str:
+    return code.name.lower().replace("_", " ")

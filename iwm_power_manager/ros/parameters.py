@@ -1,0 +1,168 @@
+"""Parameters declared from one table: type, default, range, unit, description, and when each may change.
+
+rclpy checks types and numeric ranges against the descriptors; what it cannot check (choices, NaN, lengths, the state of
+the node) is checked here, when a parameter is set, so that a bad value never reaches the control loop. The table is
+also what `docs/interface.md` is tested against.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    ParameterUninitializedException,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from iwm_power_manager.errors import IwmError
+
+Value = bool | int | float | str | list[str] | list[int]
+
+
+class Change(enum.Enum):
+    """When a parameter may change."""
+
+    NEVER = "at start only"
+    UNCONFIGURED = "while unconfigured"
+    ALWAYS = "at any time"
+
+
+class ParameterError(IwmError):
+    """A parameter given at start is wrong."""
+
+
+class Spec(NamedTuple):
+    """One parameter.
+
+    Attributes
+    ----------
+    name : dotted name
+    default : its type is the parameter's type
+    description : one sentence, with the unit where there is one
+    low, high : range of a number; of a list of numbers, of each element
+    choices : allowed texts
+    length : exact length of a list
+    change : when it may change
+    """
+
+    name: str
+    default: Value
+    description: str
+    low: float = -math.inf
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+    length: int = 0
+    change: Change = Change.UNCONFIGURED
+
+    def allowed(self) -> str:
+        """What the value may be, for messages and documentation."""
+        if self.choices:
+            return " | ".join(self.choices)
+        if self.length:
+            return f"{self.length} different names"
+        if isinstance(self.default, bool):
+            return "true | false"
+        if isinstance(self.default, int | float):
+            return f"{self.low:g} to {self.high:g}"
+        if isinstance(self.default, str):
+            return "text"
+        return "a list of texts" if isinstance(self.default[0], str) else "a list of whole numbers"
+
+    def problem(self, value: Any) -> str:
+        """What is wrong with a value of the right type; "" if nothing is."""
+        wrong = False
+        if self.choices:
+            wrong = value not in self.choices
+        elif self.length:
+            wrong = len(value) != self.length or len(set(value)) != self.length or not all(value)
+        elif isinstance(self.default, list):
+            wrong = not all(self.low <= item <= self.high for item in value if not isinstance(item, str))
+        elif isinstance(self.default, int | float) and not isinstance(self.default, bool):
+            # Written so that NaN, which rclpy's own range check lets through, is refused.
+            wrong = not self.low <= value <= self.high
+        return f"{self.name}: {value!r} is not allowed; allowed: {self.allowed()}" if wrong else ""
+
+    def descriptor(self) -> ParameterDescriptor:
+        """What tools like `ros2 param describe` show, and what rclpy enforces."""
+        descriptor = ParameterDescriptor(
+            name=self.name,
+            description=f"{self.description} Changes {self.change.value}.",
+            additional_constraints=self.allowed() if self.choices or self.length else "",
+            read_only=self.change is Change.NEVER,
+        )
+        if isinstance(self.default, float):
+            descriptor.floating_point_range = [FloatingPointRange(from_value=self.low, to_value=self.high)]
+        elif isinstance(self.default, int) and not isinstance(self.default, bool):
+            descriptor.integer_range = [IntegerRange(from_value=int(self.low), to_value=int(self.high))]
+        return descriptor
+
+
+def declare(node: Node, specs: Iterable[Spec]) -> dict[str, Any]:
+    """Declare all parameters and return their values at start.
+
+    Raises
+    ------
+    ParameterError
+        A parameter given at start has the wrong type or a value that is not allowed.
+    """
+    values = {}
+    for spec in specs:
+        try:
+            value = node.declare_parameter(spec.name, spec.default, spec.descriptor()).value
+        except (InvalidParameterTypeException, InvalidParameterValueException, ParameterUninitializedException):
+            given = node._parameter_overrides.get(spec.name)  # noqa: SLF001 - the exceptions do not carry the value
+            raise ParameterError(
+                f"parameter {spec.name}: {given.value if given else None!r} is not allowed; "
+                f"allowed: {spec.allowed()} ({_type_name(spec)})"
+            ) from None
+        problem = spec.problem(value)
+        if problem:
+            raise ParameterError(f"parameter {problem}")
+        values[spec.name] = _plain(value)
+    return values
+
+
+def check_change(
+    specs: Mapping[str, Spec],
+    parameters: Sequence[Parameter],
+    configured: bool,
+    together: Callable[[dict[str, Any]], str] = lambda _: "",
+) -> SetParametersResult:
+    """Accept or refuse a change of parameters, as a callback of `add_on_set_parameters_callback` must.
+
+    Parameters
+    ----------
+    specs : all parameters of the node by name
+    parameters : the new ones
+    configured : the node has left the unconfigured state
+    together : says what is wrong with the new values taken together, "" if nothing is
+    """
+    new = {}
+    for parameter in parameters:
+        spec = specs.get(parameter.name)
+        if spec is None:  # one of rclpy's own, such as use_sim_time
+            continue
+        if configured and spec.change is not Change.ALWAYS:
+            return SetParametersResult(successful=False, reason=f"{spec.name} changes only {spec.change.value}")
+        problem = spec.problem(parameter.value)
+        if problem:
+            return SetParametersResult(successful=False, reason=problem)
+        new[spec.name] = _plain(parameter.value)
+    problem = together(new)
+    return SetParametersResult(successful=not problem, reason=problem)
+
+
+def _plain(value: Any) -> Any:
+    """Lists of numbers come as arrays; everything else is plain already."""
+    return list(value) if not isinstance(value, bool | int | float | str) else value
+
+
+def _type_name(spec: Spec) -> str:
+    return Parameter.Type.from_parameter_value(spec.default).name.lower()

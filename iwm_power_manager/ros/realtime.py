@@ -1,0 +1,72 @@
+"""Keeping other work off the control path: garbage collection, scheduling, affinity, memory.
+
+Everything here is asked of the operating system and may be refused; what was refused is returned as text, so that the
+node can warn and go on.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+
+
+def parse_affinity(text: str) -> set[int]:
+    """Processors named in a list such as "0,2"; empty for "".
+
+    Raises
+    ------
+    ValueError
+        The text is no such list; the message says so.
+    """
+    try:
+        processors = {int(part) for part in text.split(",")} if text.strip() else set()
+    except ValueError:
+        raise ValueError(f"{text!r} is no list of processors such as '0,2'") from None
+    if any(processor < 0 for processor in processors):
+        raise ValueError(f"{text!r} has a negative processor")
+    return processors
+
+
+def stop_automatic_collection() -> None:
+    """Collect once, exempt all that lives now from later collections, and never collect by surprise again.
+
+    A full collection of a process that has numba loaded takes some 50 ms; of what has come since `gc.freeze`, well
+    under one. `collect` has to be called now and then, at a time that suits.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+
+def resume_automatic_collection() -> None:
+    """Undo `stop_automatic_collection`."""
+    gc.enable()
+    gc.unfreeze()
+
+
+def request(priority: int, processors: set[int], lock_memory: bool) -> list[str]:
+    """Ask for a SCHED_FIFO priority of the calling thread (0: not), processors (empty: all) and locked memory.
+
+    Returns
+    -------
+    what was refused, in words; empty if nothing was
+    """
+    refused = []
+    if processors:
+        try:
+            os.sched_setaffinity(0, processors)
+        except OSError as error:
+            refused.append(f"CPU affinity {sorted(processors)}: {error.strerror}")
+    if priority:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        except OSError as error:
+            refused.append(f"SCHED_FIFO priority {priority}: {error.strerror}")
+    if lock_memory:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+            refused.append(f"locked memory: {os.strerror(ctypes.get_errno())}")
+    return refused
