@@ -1,0 +1,1 @@
+"""The control law: pure functions of numbers, no ROS, no files, no clock."""

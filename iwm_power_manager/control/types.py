@@ -103,3 +103,109 @@ class Command(NamedTuple):
     rear_power_w: float
     front_slip: float
     rear_slip: float
+
+
+class Settings(NamedTuple):
+    """Tuning of the law. `default_settings` has the values and their reasons.
+
+    Attributes
+    ----------
+    strategy : EQUAL ... PREVIEW
+    decision_period_s : the split is decided this often
+    share_rate_per_s : fastest change of the applied front share
+    gate_mode : GATE_MODE_*
+    critical_slip : Table 2's slip, > 0
+    gate_hysteresis : a gated axle is freed when its slip is this far inside again
+    gate_driving : also gate driving slip
+    slip_target : slip the limiter holds, > 0, below `critical_slip`
+    slip_limiter_s : time constant with which the limiter steers a wheel to its target
+    slip_filter_s : low-pass filter of the slip and of the road torque estimate; 0 is none
+    slip_speed_floor_mps : denominator of slip is at least this: measured slip says nothing at rest
+    slew_up_nmps : fastest growth of a driving torque, N m/s
+    slew_down_nmps : fastest way of a torque to zero, N m/s (gates and limits may be faster)
+    slew_regeneration_nmps : fastest growth of a regenerative torque, N m/s (friction fills in meanwhile)
+    switching_power_w : `instantaneous*`: a change of the share has to save this much power
+    """
+
+    strategy: int
+    decision_period_s: float
+    share_rate_per_s: float
+    gate_mode: int
+    critical_slip: float
+    gate_hysteresis: float
+    gate_driving: bool
+    slip_target: float
+    slip_limiter_s: float
+    slip_filter_s: float
+    slip_speed_floor_mps: float
+    slew_up_nmps: float
+    slew_down_nmps: float
+    slew_regeneration_nmps: float
+    switching_power_w: float
+
+
+def default_settings(strategy: str = "equal") -> Settings:
+    """Settings every tool and node starts from."""
+    return Settings(
+        strategy=STRATEGIES[strategy],
+        decision_period_s=0.1,  # the paper's step of the Markov chain
+        share_rate_per_s=10.0,  # all the power changes axle in 0.1 s; the sum of the torques stays, so nothing is felt
+        gate_mode=GATE_MODE_LIMITER,
+        critical_slip=0.2,  # paper
+        gate_hysteresis=0.05,
+        gate_driving=True,
+        slip_target=0.15,  # 99.7 % of the peak friction of the paper's tyre, and a margin to the critical slip
+        slip_limiter_s=0.03,
+        slip_filter_s=0.0,
+        slip_speed_floor_mps=1.0,
+        slew_up_nmps=1600.0,  # from rest to the peak torque in 0.125 s
+        slew_down_nmps=20000.0,  # from the peak torque to zero in one step of 10 ms
+        slew_regeneration_nmps=4000.0,  # to full regeneration in 0.02 s
+        switching_power_w=100.0,
+    )
+
+
+class ControllerState(NamedTuple):
+    """What the law remembers from one step to the next; `initial_state` makes the first one.
+
+    Attributes
+    ----------
+    steps : steps taken
+    decisions : decisions taken
+    decision_age_s : time since the last one
+    decided_share, applied_share : front share, 0..1
+    front_motor_nm, rear_motor_nm : motor torque of each wheel of the axle in the last command
+    front_total_nm, rear_total_nm : the same with the friction brake
+    front_speed_radps, rear_speed_radps : mean wheel speed of the axle in the last step
+    front_road_nm, rear_road_nm : filtered estimate of the torque the road takes from a wheel
+    front_slip, rear_slip : filtered slip
+    front_gated, rear_gated : Table 2
+    front_heat, rear_heat : heat index of the motors, 0 cold to 1 hot
+    """
+
+    steps: int
+    decisions: int
+    decision_age_s: float
+    decided_share: float
+    applied_share: float
+    front_motor_nm: float
+    rear_motor_nm: float
+    front_total_nm: float
+    rear_total_nm: float
+    front_speed_radps: float
+    rear_speed_radps: float
+    front_road_nm: float
+    rear_road_nm: float
+    front_slip: float
+    rear_slip: float
+    front_gated: bool
+    rear_gated: bool
+    front_heat: float
+    rear_heat: float
+
+
+def initial_state() -> ControllerState:
+    """The law's memory before its first step: at rest, cold, power split equally."""
+    return ControllerState(
+        0, 0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False, False, 0.0, 0.0
+    )

@@ -1,0 +1,65 @@
+"""Slip of an axle from its wheels, and the slip limiter.
+
+The limiter knows, from the last command and the wheel's acceleration, which torque the road is taking from the wheel.
+The largest torque it allows is that, plus what turns the wheel towards the target slip within a time constant. Far
+from the limit that is more than anybody asks for; at the limit it holds the wheel at the target, where the tyre gives
+almost its peak force, instead of letting it swing across the critical slip as Table 2's on/off gate does.
+"""
+
+from __future__ import annotations
+
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.tyre import slip_ratio
+
+#: The limiter never steers to less than this slip speed, m/s: at walking pace a slip of 0.15 is within the noise.
+LEAST_SLIP_SPEED_MPS = 0.3
+
+#: Room where the limiter has no say, N m: more than any wheel can be asked for.
+UNLIMITED_NM = 1e9
+
+
+@kernel
+def axle_slip(left_radps: float, right_radps: float, speed_mps: float, radius_m: float, floor_mps: float) -> float:
+    """Slip of the axle's worse wheel (eq. 10)."""
+    left = slip_ratio(left_radps, speed_mps, radius_m, floor_mps)
+    right = slip_ratio(right_radps, speed_mps, radius_m, floor_mps)
+    return left if abs(left) > abs(right) else right
+
+
+@kernel
+def filtered(previous: float, value: float, dt_s: float, time_constant_s: float) -> float:
+    """First-order low pass, stepped implicitly; a time constant of 0 passes the value through."""
+    return previous + dt_s / (time_constant_s + dt_s) * (value - previous)
+
+
+@kernel
+def road_torque_nm(applied_nm: float, speed_before_radps: float, speed_radps: float, dt_s: float, inertia: float) -> float:
+    """Torque the road took from a wheel over the last step (eq. 11 solved for r F)."""
+    return applied_nm - inertia * (speed_radps - speed_before_radps) / dt_s
+
+
+@kernel
+def torque_room_nm(
+    braking: bool,
+    road_nm: float,
+    wheel_speed_radps: float,
+    speed_mps: float,
+    slip_target: float,
+    time_constant_s: float,
+    hold_below_mps: float,
+    radius_m: float,
+    inertia: float,
+) -> float:
+    """Largest torque, N m >= 0, in the direction of the demand that does not drive a wheel beyond the target slip.
+
+    Braking below `hold_below_mps` is not limited: the brakes have to be able to hold a car at rest.
+    """
+    if braking:
+        if speed_mps < hold_below_mps:
+            return UNLIMITED_NM
+        slip_speed = max(slip_target * speed_mps, LEAST_SLIP_SPEED_MPS)
+        target = max(speed_mps - slip_speed, 0.0) / radius_m
+        return max(-(road_nm + inertia * (target - wheel_speed_radps) / time_constant_s), 0.0)
+    slip_speed = max(slip_target / (1.0 - slip_target) * speed_mps, LEAST_SLIP_SPEED_MPS)
+    target = (speed_mps + slip_speed) / radius_m
+    return max(road_nm + inertia * (target - wheel_speed_radps) / time_constant_s, 0.0)

@@ -1,0 +1,278 @@
+"""Driver, control law and plant in one process: the simulator node's loop without ROS.
+
+The order within a step is the one the nodes keep in lock-step: sensors, driver, law, plant. The same kernels on the
+same numbers give the same bits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from iwm_power_manager.actuation.limits import battery_limits_w
+from iwm_power_manager.control import law
+from iwm_power_manager.control.types import ControllerState, Measurement, Settings, initial_state
+from iwm_power_manager.cycle import Cycle
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.tyre import slip_ratio
+from iwm_power_manager.policy import PolicyTable
+from iwm_power_manager.vehicle import Vehicle, VehicleParams
+from iwm_sim import plant
+from iwm_sim.driver import DriverState, drive
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Temperature the simulated battery reports, degC. The plant has no thermal model of the pack.
+BATTERY_TEMPERATURE_DEGC = 25.0
+
+#: Columns of a run's series. Rows are taken at the start of a step; torques are what the plant did in that step.
+COLUMNS = (
+    "time_s",
+    "trace_mps",
+    "speed_mps",
+    "power_demand_w",
+    "accelerator",
+    "brake",
+    "decided_share",
+    "front_share",
+    "gate",
+    "limits",
+    "front_power_w",
+    "rear_power_w",
+    "front_motor_nm",
+    "rear_motor_nm",
+    "front_friction_nm",
+    "rear_friction_nm",
+    "front_wheel_radps",
+    "rear_wheel_radps",
+    "front_slip",
+    "rear_slip",
+    "soc",
+    "electrical_power_w",
+    "current_a",
+    "distance_m",
+    "acceleration_mps2",
+    "front_heat",
+    "rear_heat",
+    "chemical_j",
+)
+
+
+class Trace(NamedTuple):
+    """A cycle sampled at the control step, as the driver sees it; arrays of equal length.
+
+    Attributes
+    ----------
+    speed_mps : now
+    ahead_mps, ahead_mps2 : speed and slope `preview_s` from now
+    grade : rise over run, now
+    """
+
+    speed_mps: FloatArray
+    ahead_mps: FloatArray
+    ahead_mps2: FloatArray
+    grade: FloatArray
+
+
+class Noise(NamedTuple):
+    """Errors of the sensors, added to each sample; empty arrays mean none.
+
+    Attributes
+    ----------
+    speed_mps : (n,)
+    wheel_radps : (n, 4)
+    """
+
+    speed_mps: FloatArray
+    wheel_radps: FloatArray
+
+
+NO_NOISE = Noise(np.zeros(0), np.zeros((0, 4)))
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A finished run: `series` is (steps, len(COLUMNS)); `final` the plant at its end."""
+
+    dt_s: float
+    series: FloatArray
+    final: plant.PlantState
+
+    def __getitem__(self, column: str) -> FloatArray:
+        return self.series[:, COLUMNS.index(column)]
+
+
+def sample(cycle: Cycle, dt_s: float, preview_s: float) -> Trace:
+    """The trace at 0, dt, 2 dt ... up to the cycle's end, linear between its points."""
+    start = cycle.time_s[0]
+    steps = int(np.floor((cycle.time_s[-1] - start) / dt_s + 1e-9))
+    time = start + dt_s * np.arange(steps)
+
+    def speed(at: FloatArray) -> FloatArray:
+        return np.interp(at, cycle.time_s, cycle.speed_mps)
+
+    half = 0.5 * dt_s
+    return Trace(
+        speed(time),
+        speed(time + preview_s),
+        (speed(time + preview_s + half) - speed(time + preview_s - half)) / dt_s,
+        np.interp(time, cycle.time_s, cycle.grade),
+    )
+
+
+def run(
+    cycle: Cycle,
+    vehicle: Vehicle,
+    settings: Settings,
+    policy: PolicyTable,
+    friction: float,
+    *,
+    assumed_friction: float | None = None,
+    dt_s: float = 0.01,
+    substeps: int = 1,
+    soc: float = 0.8,
+    noise: Noise = NO_NOISE,
+    plant_vehicle: Vehicle | None = None,
+) -> Run:
+    """Drive a cycle.
+
+    Parameters
+    ----------
+    cycle : speed trace
+    vehicle : the car the law and the driver believe in
+    settings, policy : of the law
+    friction : peak friction coefficient of the road
+    assumed_friction : what the law is told, if it is something else
+    dt_s : control step
+    substeps : plant steps in a control step
+    soc : state of charge at the start
+    noise : errors of the sensors
+    plant_vehicle : the car as it is, if it differs
+    """
+    params = vehicle.params
+    truth = params if plant_vehicle is None else plant_vehicle.params
+    trace = sample(cycle, dt_s, params.driver.preview_s)
+    series = np.empty((trace.speed_mps.size, len(COLUMNS)))
+    start = plant.initial_plant(truth, soc, float(trace.speed_mps[0]))
+    told = friction if assumed_friction is None else assumed_friction
+    final = _loop(
+        trace,
+        start,
+        initial_state(),
+        settings,
+        params,
+        truth,
+        policy,
+        float(friction),
+        float(told),
+        float(dt_s),
+        int(substeps),
+        noise,
+        series,
+    )
+    return Run(dt_s, series, final)
+
+
+@kernel
+def measure(
+    car: plant.PlantState,
+    power_demand_w: float,
+    dt_s: float,
+    friction: float,
+    speed_error_mps: float,
+    wheel_error_radps: tuple[float, float, float, float],
+    vehicle: VehicleParams,
+) -> Measurement:
+    """What the law is told about the car. State of charge goes through single precision, as in its ROS message."""
+    soc = float(np.float32(car.soc))
+    discharge, charge = battery_limits_w(soc, BATTERY_TEMPERATURE_DEGC, vehicle.battery)
+    w = car.wheel_speed_radps
+    e = wheel_error_radps
+    return Measurement(
+        max(car.speed_mps + speed_error_mps, 0.0),
+        (max(w[0] + e[0], 0.0), max(w[1] + e[1], 0.0), max(w[2] + e[2], 0.0), max(w[3] + e[3], 0.0)),
+        power_demand_w,
+        dt_s,
+        friction,
+        discharge,
+        charge,
+        soc,
+    )
+
+
+@kernel
+def _loop(
+    trace: Trace,
+    car: plant.PlantState,
+    controller: ControllerState,
+    settings: Settings,
+    vehicle: VehicleParams,
+    truth: VehicleParams,
+    policy: PolicyTable,
+    friction: float,
+    assumed_friction: float,
+    dt_s: float,
+    substeps: int,
+    noise: Noise,
+    series: FloatArray,
+) -> plant.PlantState:
+    road = (friction, friction, friction, friction)
+    foot = DriverState(0.0)
+    radius = truth.wheel.radius_m
+    floor = truth.tyre.slip_speed_floor_mps
+    for k in range(trace.speed_mps.size):
+        speed_error = 0.0
+        wheel_error = (0.0, 0.0, 0.0, 0.0)
+        if noise.speed_mps.size > 0:
+            speed_error = noise.speed_mps[k]
+            e = noise.wheel_radps[k]
+            wheel_error = (e[0], e[1], e[2], e[3])
+        pedals, foot = drive(
+            foot,
+            car.speed_mps,
+            trace.speed_mps[k],
+            trace.ahead_mps[k],
+            trace.ahead_mps2[k],
+            trace.grade[k],
+            dt_s,
+            vehicle,
+        )
+        measurement = measure(car, pedals.power_demand_w, dt_s, assumed_friction, speed_error, wheel_error, vehicle)
+        command, controller = law.step(measurement, controller, settings, vehicle, policy)
+        before = car
+        car = plant.advance(
+            car, command.motor_torque_nm, command.friction_torque_nm, trace.grade[k], road, dt_s, substeps, truth
+        )
+        row = series[k]
+        row[0] = k * dt_s
+        row[1] = trace.speed_mps[k]
+        row[2] = before.speed_mps
+        row[3] = pedals.power_demand_w
+        row[4] = pedals.accelerator
+        row[5] = pedals.brake
+        row[6] = command.decided_share
+        row[7] = command.front_share
+        row[8] = command.gate
+        row[9] = command.limits
+        row[10] = command.front_power_w
+        row[11] = command.rear_power_w
+        row[12] = car.motor_torque_nm[0]
+        row[13] = car.motor_torque_nm[2]
+        row[14] = car.friction_torque_nm[0]
+        row[15] = car.friction_torque_nm[2]
+        row[16] = before.wheel_speed_radps[0]
+        row[17] = before.wheel_speed_radps[2]
+        row[18] = slip_ratio(before.wheel_speed_radps[0], before.speed_mps, radius, floor)
+        row[19] = slip_ratio(before.wheel_speed_radps[2], before.speed_mps, radius, floor)
+        row[20] = before.soc
+        row[21] = car.electrical_power_w
+        row[22] = car.current_a
+        row[23] = before.distance_m
+        row[24] = car.acceleration_mps2
+        row[25] = car.heat[0]
+        row[26] = car.heat[2]
+        row[27] = car.energies.chemical_j
+    return car

@@ -1,0 +1,109 @@
+"""The simulated driver: follows a speed trace with two pedals, and what the pedals ask for.
+
+The driver looks a little ahead, knows the car's mass and road load, and corrects the speed error with a PI controller
+whose integral stops while a pedal is fully pressed. The pedals mean power at the wheels (docs/model.md):
+
+    accelerator a:  P = a * P_max(v),   P_max = min(4 T_peak w, 4 P_motor),  w = v / r
+    brake b:        P = -b * k m g v
+
+both with the speed floor below which a power can no longer be turned into a force (eq. 16 at rest).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, road_load_n
+from iwm_power_manager.vehicle import VehicleParams
+
+#: Below these speeds, m/s, trace and car count as standing; the driver then rests a foot on the brake.
+STANDING_TRACE_MPS = 0.01
+STANDING_CAR_MPS = 0.1
+HOLDING_BRAKE = 0.1
+
+
+class DriverState(NamedTuple):
+    """What the driver remembers: integral of the speed error, m."""
+
+    error_integral_m: float
+
+
+class Pedals(NamedTuple):
+    """What the driver does: pedals 0..1, and the power demand they stand for, W, braking negative."""
+
+    accelerator: float
+    brake: float
+    power_demand_w: float
+
+
+@kernel
+def full_power_w(speed_mps: float, vehicle: VehicleParams) -> float:
+    """Power of the fully pressed accelerator, W."""
+    motor = vehicle.motor
+    wheel_speed = max(speed_mps, vehicle.driver.power_speed_floor_mps) / vehicle.wheel.radius_m
+    return 4.0 * min(motor.peak_torque_nm * wheel_speed, motor.max_power_w)
+
+
+@kernel
+def full_braking_w(speed_mps: float, vehicle: VehicleParams) -> float:
+    """Power of the fully pressed brake pedal, W, positive."""
+    force = vehicle.driver.full_brake_g * vehicle.chassis.mass_kg * GRAVITY_MPS2
+    return force * max(speed_mps, vehicle.driver.power_speed_floor_mps)
+
+
+@kernel
+def pedal_power_w(accelerator: float, brake: float, speed_mps: float, vehicle: VehicleParams) -> float:
+    """Power demand of two pedals, W; the brake overrides the accelerator."""
+    if brake > 0.0:
+        return -brake * full_braking_w(speed_mps, vehicle)
+    return accelerator * full_power_w(speed_mps, vehicle)
+
+
+@kernel
+def drive(
+    state: DriverState,
+    speed_mps: float,
+    trace_mps: float,
+    trace_ahead_mps: float,
+    acceleration_ahead_mps2: float,
+    grade: float,
+    dt_s: float,
+    vehicle: VehicleParams,
+) -> tuple[Pedals, DriverState]:
+    """One look at the speedometer.
+
+    Parameters
+    ----------
+    speed_mps : of the car
+    trace_mps : speed the trace has now
+    trace_ahead_mps, acceleration_ahead_mps2 : speed and slope of the trace `preview_s` from now
+    grade : rise over run, which the driver feels
+    dt_s : time until the next look
+    """
+    if trace_mps < STANDING_TRACE_MPS and trace_ahead_mps < STANDING_TRACE_MPS and speed_mps < STANDING_CAR_MPS:
+        power = pedal_power_w(0.0, HOLDING_BRAKE, speed_mps, vehicle)
+        return Pedals(0.0, HOLDING_BRAKE, power), DriverState(0.0)
+    settings = vehicle.driver
+    error = trace_mps - speed_mps
+    load = road_load_n(speed_mps, grade, vehicle.chassis)
+    force = (
+        equivalent_mass_kg(vehicle) * acceleration_ahead_mps2
+        + load
+        + settings.proportional_n_per_mps * error
+        + settings.integral_n_per_m * state.error_integral_m
+    )
+    wanted = force * max(speed_mps, settings.power_speed_floor_mps)
+    accelerator = 0.0
+    brake = 0.0
+    saturated = False
+    if wanted > 0.0:
+        accelerator = wanted / full_power_w(speed_mps, vehicle)
+        saturated = accelerator > 1.0 and error > 0.0
+        accelerator = min(accelerator, 1.0)
+    else:
+        brake = -wanted / full_braking_w(speed_mps, vehicle)
+        saturated = brake > 1.0 and error < 0.0
+        brake = min(brake, 1.0)
+    integral = state.error_integral_m if saturated else state.error_integral_m + error * dt_s
+    return Pedals(accelerator, brake, pedal_power_w(accelerator, brake, speed_mps, vehicle)), DriverState(integral)

@@ -1,0 +1,117 @@
+"""Deterministic dynamic programming over a whole cycle known in advance.
+
+The bound nobody can beat: the split that costs least battery energy plus switching cost when every future demand is
+known. It takes demand and speed from a drive of the cycle with equal split (the driver asks for almost the same whatever
+the split does) and lets slip settle; the schedule it finds is then driven in the closed loop like any other strategy. The generalized rule (the paper's GRDP) is a straight line fitted to its P_f over P_dem.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from iwm_power_manager.control.split import PRICE_OF_MISSING
+from iwm_power_manager.jit import kernel, parallel_kernel
+from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
+from iwm_power_manager.vehicle import VehicleParams
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@parallel_kernel
+def _tabulate(power_w, speed_mps, samples, share, friction, dt_s, vehicle, out):
+    for k in numba.prange(out.shape[0]):
+        for u in range(share.size):
+            total = 0.0
+            for i in range(k * samples, min((k + 1) * samples, power_w.size)):
+                speed = max(speed_mps[i], vehicle.driver.power_speed_floor_mps)
+                force = demand_force_n(power_w[i], speed_mps[i], vehicle)
+                power, missing = split_power_w(force, speed, share[u], friction, True, vehicle)
+                total += (power + PRICE_OF_MISSING * missing * speed) * dt_s
+            out[k, u] = total
+
+
+@kernel
+def cheapest_path(cost_j, share, switching_cost_j, switching_fixed_cost_j, path):
+    """Fill `path` with the index of the share of each step that minimises the sum of step and switching costs.
+
+    Parameters
+    ----------
+    cost_j : float64[n, U], cost of each share in each step
+    share : float64[U]
+    switching_cost_j : cost of a change of the share by 1, proportional
+    switching_fixed_cost_j : cost of any change
+    path : int64[n], output
+    """
+    n, n_u = cost_j.shape
+    origin = np.zeros((n, n_u), dtype=np.int16)
+    total = cost_j[0].copy()
+    new = np.empty(n_u)
+    for k in range(1, n):
+        for u in range(n_u):
+            best = total[u]
+            came = u
+            for s in range(n_u):
+                candidate = total[s] + switching_cost_j * abs(share[u] - share[s]) + switching_fixed_cost_j
+                if s != u and candidate < best:
+                    best = candidate
+                    came = s
+            origin[k, u] = came
+            new[u] = best + cost_j[k, u]
+        total[:] = new
+    last = np.argmin(total)
+    for k in range(n - 1, -1, -1):
+        path[k] = last
+        last = origin[k, last]
+
+
+def schedule(
+    power_w: FloatArray,
+    speed_mps: FloatArray,
+    dt_s: float,
+    decision_period_s: float,
+    vehicle: VehicleParams,
+    friction: float,
+    share: FloatArray,
+    switching_cost_j: float = 0.0,
+    switching_fixed_cost_j: float = 0.0,
+) -> FloatArray:
+    """Best front share for each decision of a drive whose demand and speed are known from its start to its end.
+
+    Parameters
+    ----------
+    power_w, speed_mps : float64[n], demand and speed in each control step, as a drive of the same cycle had them
+    dt_s, decision_period_s : control step and decision period; the latter a multiple of the former
+    vehicle, friction : what is driven, and on what
+    share : float64[U], shares to choose from
+    switching_cost_j, switching_fixed_cost_j : see `cheapest_path`
+
+    Returns
+    -------
+    float64[ceil(n * dt_s / decision_period_s)]
+    """
+    samples = round(decision_period_s / dt_s)
+    cost = np.empty((-(-power_w.size // samples), share.size))
+    _tabulate(power_w, speed_mps, samples, share, friction, dt_s, vehicle, cost)
+    path = np.empty(cost.shape[0], dtype=np.int64)
+    cheapest_path(cost, share, switching_cost_j, switching_fixed_cost_j, path)
+    return share[path]
+
+
+def fit_rule(power_w: FloatArray, front_share: FloatArray, least_power_w: float = 200.0) -> FloatArray:
+    """Straight lines P_f = a + b P_dem through a schedule, one for driving and one for braking (least squares).
+
+    Returns
+    -------
+    float64[4] : a, b for driving, a, b for braking; W and 1
+    """
+    lines = []
+    for mask in (power_w > least_power_w, power_w < -least_power_w):
+        if np.count_nonzero(mask) < 2:
+            lines += [0.0, 0.5]
+            continue
+        demand = power_w[mask]
+        design = np.column_stack((np.ones_like(demand), demand))
+        lines += np.linalg.lstsq(design, front_share[mask] * demand, rcond=None)[0].tolist()
+    return np.array(lines)
