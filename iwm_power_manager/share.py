@@ -1,4 +1,4 @@
-"""Where the files that come with the package are: `config/`, `policies/`.
+"""Where the files that come with the package are: `config/`, `policies/`, `launch/`.
 
 They lie beside the package in a source checkout, below `share/iwm_power_manager` once installed by colcon or pip. No
 ROS is needed to find them.
@@ -10,23 +10,50 @@ import os
 import sys
 from pathlib import Path
 
+from iwm_power_manager.errors import ConfigError
+
 PACKAGE = "iwm_power_manager"
 
 
 def roots() -> list[Path]:
-    """Folders that may hold `config/` and `policies/`, in order of preference."""
-    checkout = Path(__file__).resolve().parent.parent
-    prefixes = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
-    prefixes.append(Path(sys.prefix))
-    return [checkout, *(prefix / "share" / PACKAGE for prefix in prefixes)]
+    """Folders that may hold `config/` and `policies/`, in order of preference.
+
+    The checkout this module stands in, then the prefix it is installed below, then those that ROS and Python name.
+    """
+    here = Path(__file__).resolve()
+    checkout = here.parents[1]
+    found = [checkout] if (checkout / "package.xml").is_file() else []
+    prefixes = [*here.parents[2:], *map(Path, filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)))]
+    found += [prefix / "share" / PACKAGE for prefix in (*prefixes, Path(sys.prefix))]
+    return list(dict.fromkeys(root for root in found if root.is_dir()))
+
+
+def share_path(relative: Path | str) -> Path:
+    """Path of a file or folder of the package, such as `config/vehicles/jalalmaab_2015.yaml`.
+
+    Raises
+    ------
+    ConfigError
+        If the package was installed without it.
+    """
+    for root in roots():
+        if (root / relative).exists():
+            return root / relative
+    searched = ", ".join(map(str, roots())) or "no folder"
+    raise ConfigError(relative, "", f"no such file in the package; searched {searched}")
 
 
 def resolve(path: Path | str) -> Path:
-    """The file a user means by `path`.
+    """Give the file a user means by `path`.
 
     An absolute path, or one that exists seen from the current folder, is taken as it is. Otherwise it is looked for
-    among the files of the package, so that `config/vehicles/jalalmaab_2015.yaml` works from anywhere. A path that is
-    nowhere comes back unchanged: whoever opens it reports it under the name the user gave.
+    among the files of the package, so that `config/vehicles/jalalmaab_2015.yaml`, and `jalalmaab_2015` alone, work from
+    anywhere. A path that is nowhere comes back unchanged: whoever opens it reports it under the name the user gave.
+
+    Raises
+    ------
+    ConfigError
+        If a name alone fits several files of the package.
     """
     given = Path(path).expanduser()
     if given.is_absolute() or given.exists():
@@ -34,4 +61,16 @@ def resolve(path: Path | str) -> Path:
     for root in roots():
         if (root / given).exists():
             return root / given
+        matches = _files_named(root, str(given)) if len(given.parts) == 1 else []
+        if len(matches) > 1:
+            names = ", ".join(str(match.relative_to(root)) for match in matches)
+            raise ConfigError(given, "", "fits several files of the package", names)
+        if matches:
+            return matches[0]
     return given
+
+
+def _files_named(root: Path, name: str) -> list[Path]:
+    """Files below config/ and policies/ that are called `name`, with or without their suffix."""
+    files = (path for folder in ("config", "policies") for path in (root / folder).rglob("*") if path.is_file())
+    return sorted(path for path in files if name in (path.name, path.stem))

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from iwm_power_manager import share
+from iwm_power_manager.errors import ConfigError
 
 
 def test_a_file_of_the_package_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,3 +34,38 @@ def test_a_file_below_an_ament_prefix_is_found(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize("path", ["/nowhere/at/all.yaml", "nowhere/at/all.yaml"])
 def test_a_path_that_is_nowhere_comes_back_as_given(path: str) -> None:
     assert share.resolve(path) == Path(path)
+
+
+@pytest.mark.parametrize("name", ["nycc", "nycc.csv"])
+def test_a_file_of_the_package_is_found_by_its_name_alone(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert share.resolve(name) == share.share_path("config/cycles/nycc.csv")
+
+
+def test_a_name_that_fits_several_files_is_refused_with_all_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in ("grids", "vehicles"):
+        (tmp_path / "config" / folder).mkdir(parents=True)
+        (tmp_path / "config" / folder / "twin.yaml").touch()
+    monkeypatch.setattr(share, "roots", lambda: [tmp_path])
+    with pytest.raises(ConfigError, match=r"config/grids/twin\.yaml, config/vehicles/twin\.yaml"):
+        share.resolve("twin")
+
+
+def test_a_missing_file_of_the_package_is_reported_with_the_folders_searched() -> None:
+    with pytest.raises(ConfigError, match=r"config/nowhere\.yaml: no such file in the package; searched /"):
+        share.share_path("config/nowhere.yaml")
+
+
+@pytest.mark.parametrize("library", ["lib/python3.12/site-packages", "local/lib/python3.12/dist-packages"])
+def test_the_files_of_an_installation_are_found_without_any_variable(
+    library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared = tmp_path / "share" / "iwm_power_manager"
+    shared.mkdir(parents=True)
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    monkeypatch.setattr(share, "__file__", str(tmp_path / library / "iwm_power_manager" / "share.py"))
+    assert share.roots()[0] == shared

@@ -1,0 +1,86 @@
+# `make` lists the targets. Every target does its own set-up: scripts/setup_venv makes .venv once and then stays quiet.
+SHELL := /bin/bash
+MAKEFLAGS += --no-print-directory
+.DEFAULT_GOAL := help
+
+BIN := .venv/bin
+# Extra arguments, as in `make demo ARGS=--help` or `make test PYTEST_ARGS="-k slip"`.
+ARGS ?=
+PYTEST_ARGS ?=
+
+# What runs here talks to nothing outside this machine and logs below the checkout, unless the user says otherwise.
+export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
+export ROS_LOG_DIR ?= $(CURDIR)/log/ros
+
+##@ The two commands
+.PHONY: demo test
+demo: setup-run  ## Drive the New York City Cycle over DDS, record it, show the result
+	@$(BIN)/demo $(ARGS)
+
+test: lint type  ## Linters, types and all tests
+	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+##@ Results
+.PHONY: policies study bench
+CYCLES := $(foreach cycle,ftp75 hwfet nycc,--cycle config/cycles/$(cycle).csv)
+policies: setup-run  ## Solve the shipped policies again (the same tables come out)
+	@for friction in 0.9 0.5 0.2; do \
+	  $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml $(CYCLES) --friction $$friction \
+	    --grid fine --output policies $(ARGS) || exit; \
+	done
+
+study: setup-run  ## All tables and figures of the paper, and what beats them
+	@$(BIN)/evaluate --study runs/study $(ARGS)
+
+bench: setup-dev  ## Time solver, closed loop, control path and bags on this machine
+	@$(BIN)/python -m iwm_sim.bench $(ARGS)
+
+##@ Safety
+.PHONY: faults soak nightly coverage mutation
+faults: setup-run  ## Fault campaign over DDS with the simulator in the loop
+	@$(BIN)/python -m iwm_sim.faults $(ARGS)
+
+soak: setup-dev  ## 30 minutes in real time at 100 Hz: memory, deadlines, counts
+	@$(BIN)/python -m iwm_sim.soak $(ARGS)
+
+nightly: setup-dev  ## The tests that are too long for every run, and far more random cases in the others
+	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest -m "nightly or not nightly" $(PYTEST_ARGS)
+
+# Compiled kernels leave no trace, so the safety code is covered as plain Python.
+SAFETY := iwm_power_manager/actuation/*,iwm_power_manager/control/*
+coverage: setup-dev  ## Line and branch coverage of control law, limits, gating and input checks: 100 %
+	@$(BIN)/coverage erase
+	@NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest test/actuation test/control $(PYTEST_ARGS)
+	@$(BIN)/coverage combine --quiet
+	@$(BIN)/coverage report --include='$(SAFETY)' --fail-under=100
+
+mutation: setup-dev  ## Mutate the same modules: do the tests notice?
+	@$(BIN)/python scripts/mutation $(ARGS)
+
+##@ Parts
+.PHONY: lint type format build clean setup-run setup-dev help
+lint: setup-dev  ## ruff: style, docstrings, likely mistakes
+	@$(BIN)/ruff check .
+
+type: setup-dev  ## mypy, strict
+	@$(BIN)/mypy
+
+format: setup-dev  ## Reformat the sources
+	@$(BIN)/ruff check --fix . && $(BIN)/ruff format .
+
+build: setup-dev  ## colcon build into build/ and install/
+	@scripts/colcon_build
+
+clean:  ## Remove what was built, logged or cached here (.venv stays)
+	@rm -rf build install log dist .pytest_cache .hypothesis .mypy_cache .ruff_cache .coverage .coverage.* htmlcov *.egg-info
+	@find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
+
+setup-run:
+	@scripts/setup_venv run
+
+setup-dev:
+	@scripts/setup_venv dev
+
+help:
+	@awk 'BEGIN {FS = ":.*## "} /^##@/ {printf "\n%s\n", substr($$0, 5)} \
+	  /^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile

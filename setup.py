@@ -1,0 +1,98 @@
+"""Build description, read alike by colcon (`ros.ament_python`) and by pip. Name and version stand in package.xml."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+from setuptools import find_packages, setup
+
+# After setuptools, which replaces the standard library's missing distutils.
+from distutils.command.install_data import install_data  # isort: skip
+
+ROOT = Path(__file__).resolve().parent
+MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
+NAME = str(MANIFEST.findtext("name"))
+
+EXECUTABLES = {
+    "demo": "iwm_sim.demo:main",
+    "evaluate": "iwm_sim.study.evaluate:main",
+    "power_manager": "iwm_power_manager.nodes.power_manager:main",
+    "recorder": "iwm_power_manager.nodes.recorder:main",
+    "replay": "iwm_power_manager.tools.replay:main",
+    "simulator": "iwm_sim.simulator:main",
+    "solve_policy": "iwm_power_manager.tools.solve_policy:main",
+}
+
+
+def shared_files() -> list[tuple[str, list[str]]]:
+    """What goes to share/, folder by folder, with the two files that make this a ROS package."""
+    files = [
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml", "LICENSE"]),
+    ]
+    for top in ("config", "launch", "policies"):
+        for folder, _, names in sorted(os.walk(top)):
+            sources = [f"{folder}/{name}" for name in sorted(names) if not name.startswith(".")]
+            if sources and not folder.endswith("__pycache__"):
+                files.append((f"share/{NAME}/{folder}", sources))
+    return files
+
+
+class InstallData(install_data):
+    """Adds, for pip, what colcon makes by itself: the executables where `ros2 run` looks for them."""
+
+    def run(self) -> None:
+        """Copy the data files and, into a wheel, write a launcher for every executable."""
+        super().run()
+        if self.distribution.get_command_obj("bdist_wheel", create=False) is None:
+            return
+        folder = Path(self.install_dir) / "lib" / NAME
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in EXECUTABLES:
+            launcher = folder / name
+            launcher.write_text(f'#!/bin/sh\nexec "$(dirname -- "$0")/../../bin/{name}" "$@"\n')
+            launcher.chmod(0o755)
+            self.outfiles.append(str(launcher))
+
+
+setup(
+    name=NAME,
+    version=MANIFEST.findtext("version"),
+    description="Stochastic power management for cars with in-wheel motors, as ROS 2 nodes and offline tools",
+    long_description=(ROOT / "README.md").read_text(encoding="utf-8") if (ROOT / "README.md").exists() else "",
+    long_description_content_type="text/markdown",
+    author=MANIFEST.findtext("author"),
+    author_email=MANIFEST.find("author").get("email"),
+    maintainer=MANIFEST.findtext("maintainer"),
+    maintainer_email=MANIFEST.find("maintainer").get("email"),
+    license=MANIFEST.findtext("license"),
+    python_requires=">=3.12",
+    packages=find_packages(include=["iwm_power_manager*", "iwm_sim*"]),
+    package_data={"iwm_power_manager": ["py.typed"], "iwm_sim": ["py.typed"], "iwm_sim.study": ["assets/*"]},
+    data_files=shared_files(),
+    install_requires=[
+        "lz4",
+        "matplotlib",
+        "mcap",
+        "numba",
+        "numpy",
+        "pyyaml",
+        "rosbags",
+        "scipy",
+        "tqdm",
+        "zstandard",
+    ],
+    extras_require={
+        # Only where no ROS 2 Jazzy is installed: the same rclpy and Fast DDS as wheels.
+        "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
+        "test": ["pytest"],
+    },
+    zip_safe=False,
+    entry_points={"console_scripts": [f"{name} = {target}" for name, target in EXECUTABLES.items()]},
+    cmdclass={"install_data": InstallData},
+    # The first line of a script cannot hold a path with a space; then PATH has to lead to the Python.
+    options={"build_scripts": {"executable": "/usr/bin/env python3"}} if " " in sys.executable else {},
+)

@@ -1,0 +1,56 @@
+"""What all tests share: an own DDS domain on this machine only, logs that leave no trace, Hypothesis profiles."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import tempfile
+from pathlib import Path
+from typing import IO
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+ROOT = Path(__file__).resolve().parents[1]
+
+settings.register_profile("default", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("nightly", settings.get_profile("default"), max_examples=20_000)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+
+def _claim_domain() -> tuple[int, IO[str]]:
+    """Find a DDS domain that no other test run on this machine has claimed; it is free again when the file closes."""
+    folder = Path(tempfile.gettempdir()) / f"iwm_power_manager-domains-{os.getuid()}"
+    folder.mkdir(exist_ok=True)
+    # Above 101 the ports of a domain reach into those that Linux hands out to clients.
+    for domain in random.sample(range(1, 102), 101):
+        claim = (folder / str(domain)).open("w")
+        try:
+            fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            claim.close()
+            continue
+        return domain, claim
+    raise RuntimeError("every DDS domain from 1 to 101 is claimed by a test run")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Set the environment before any module is imported; child processes inherit it."""
+    domain, claim = _claim_domain()
+    logs = tempfile.TemporaryDirectory(prefix="iwm-ros-log-")
+    config.add_cleanup(claim.close)
+    config.add_cleanup(logs.cleanup)
+    os.environ.update(
+        ROS_DOMAIN_ID=str(domain),
+        ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
+        ROS_LOG_DIR=logs.name,
+        MPLBACKEND="Agg",
+    )
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep what starts processes on one worker under xdist (`-n 2 --dist loadgroup`): they share two cores."""
+    for item in items:
+        if {"ros", "packaging"} & set(item.path.relative_to(ROOT).parts):
+            item.add_marker(pytest.mark.xdist_group("processes"))
