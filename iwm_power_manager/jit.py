@@ -65,5 +65,8 @@ def kernel(function: F) -> F:
 
 
 def parallel_kernel(function: F) -> F:
-    """As `kernel`, with `prange` loops spread over the cores."""
-    return _compile(function, parallel=True)
+    """As `kernel`, but it runs without the interpreter's lock: threads can work on separate parts of its output.
+
+    Not for the control law, which would have to wait for the lock after every step.
+    """
+    return _compile(function, nogil=True)

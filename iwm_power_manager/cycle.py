@@ -1,0 +1,176 @@
+"""Drive cycles: CSV -> `Cycle`, every mistake named with its line.
+
+A file has the columns `time_s,speed_mps` and optionally `grade` (rise over run, uphill positive), in any order, after
+one header line. Steps may be uneven and may have gaps: between two points, speed and grade change linearly with time.
+Empty lines and lines that start with # are skipped.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import read_text, sha256_of
+
+MAX_SPEED_MPS = 70.0
+MAX_GRADE = 0.5
+#: Two days at 10 Hz: beyond that, the time column is not in seconds.
+MAX_SAMPLES = 2_000_000
+
+_REQUIRED = ("time_s", "speed_mps")
+_RANGES = {"speed_mps": (0.0, MAX_SPEED_MPS), "grade": (-MAX_GRADE, MAX_GRADE)}
+
+
+@dataclass(frozen=True, eq=False)
+class Cycle:
+    """A speed trace over time.
+
+    Attributes
+    ----------
+    name : the file's name without its ending
+    time_s : float64[n], strictly increasing, n >= 2
+    speed_mps : float64[n], 0..70
+    grade : float64[n], rise over run; zero where the file has no such column
+    sha256 : hash of the file's bytes, or of the arrays if the cycle does not come from a file
+    path : the file ("" if there is none)
+    """
+
+    name: str
+    time_s: NDArray[np.float64]
+    speed_mps: NDArray[np.float64]
+    grade: NDArray[np.float64]
+    sha256: str
+    path: str = ""
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last point."""
+        return float(self.time_s[-1] - self.time_s[0])
+
+    @property
+    def distance_m(self) -> float:
+        """Length of the trace: its speed, integrated."""
+        return float(np.sum(np.diff(self.time_s) * (self.speed_mps[1:] + self.speed_mps[:-1])) / 2.0)
+
+    def resample(self, dt_s: float) -> Cycle:
+        """The same trace at an even step, from its first point to the last whole step inside it.
+
+        Time starts at zero. A cycle shorter than one step is refused.
+        """
+        if not (math.isfinite(dt_s) and dt_s > 0.0):
+            raise ConfigError(self.path or self.name, "dt_s", f"{dt_s} is out of range", "> 0 s")
+        # A duration that is a whole number of steps must not lose its last one to rounding.
+        steps = math.floor(self.duration_s / dt_s + 1e-9)
+        if steps < 1:
+            raise ConfigError(self.path or self.name, "time_s", f"{self.duration_s:g} s is shorter than a step", f">= {dt_s:g} s")
+        if steps > MAX_SAMPLES:
+            raise ConfigError(
+                self.path or self.name,
+                "time_s",
+                f"{self.duration_s:g} s is too long for steps of {dt_s:g} s",
+                f"<= {MAX_SAMPLES * dt_s:g} s",
+            )
+        time = np.arange(steps + 1) * dt_s
+        at = self.time_s[0] + time
+        return Cycle(
+            name=self.name,
+            time_s=time,
+            speed_mps=np.interp(at, self.time_s, self.speed_mps),
+            grade=np.interp(at, self.time_s, self.grade),
+            sha256=self.sha256,
+            path=self.path,
+        )
+
+
+def make_cycle(name: str, time_s, speed_mps, grade=None) -> Cycle:
+    """A `Cycle` from arrays, with the same checks as a file's."""
+    time = np.ascontiguousarray(time_s, dtype=np.float64)
+    speed = np.ascontiguousarray(speed_mps, dtype=np.float64)
+    slope = np.zeros_like(time) if grade is None else np.ascontiguousarray(grade, dtype=np.float64)
+    if not (time.ndim == 1 and time.shape == speed.shape == slope.shape):
+        raise ConfigError(name, "", f"columns of different lengths: {time.shape}, {speed.shape}, {slope.shape}")
+    _check_rows(name, [f"sample {i}" for i in range(time.size)], {"time_s": time, "speed_mps": speed, "grade": slope})
+    digest = hashlib.sha256(time.tobytes() + speed.tobytes() + slope.tobytes()).hexdigest()
+    return Cycle(name, time, speed, slope, digest)
+
+
+def load_cycle(path: Path | str) -> Cycle:
+    """Read a cycle's CSV.
+
+    Raises
+    ------
+    ConfigError
+        The file is unreadable, empty or too short, lacks a column, has one that is unknown or stands twice, or holds
+        a value that is no number, not finite or out of range, or a time that does not increase. The message names
+        the line.
+    """
+    lines = [
+        (number, line)
+        for number, line in enumerate(read_text(path).splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not lines:
+        raise ConfigError(path, "", "is empty", "a header line time_s,speed_mps[,grade] and two rows or more")
+    header = [name.strip() for name in _fields(path, *lines[0])]
+    for name in _REQUIRED:
+        if name not in header:
+            raise ConfigError(path, f"line {lines[0][0]}", f"column '{name}' is missing", "time_s,speed_mps[,grade]")
+    for name in header:
+        if name not in (*_REQUIRED, "grade") or header.count(name) > 1:
+            problem = "stands twice" if header.count(name) > 1 else "is unknown"
+            raise ConfigError(path, f"line {lines[0][0]}", f"column '{name}' {problem}", "time_s,speed_mps[,grade]")
+
+    values = np.empty((len(lines) - 1, len(header)))
+    for row, (number, line) in enumerate(lines[1:]):
+        fields = _fields(path, number, line)
+        if len(fields) != len(header):
+            raise ConfigError(path, f"line {number}", f"has {len(fields)} values", f"{len(header)}, as in the header")
+        for column, field in enumerate(fields):
+            try:
+                values[row, column] = float(field)
+            except ValueError:
+                raise ConfigError(path, f"line {number}", f"{header[column]} '{field.strip()}' is no number") from None
+    columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(header)}
+    columns.setdefault("grade", np.zeros(len(values)))
+    _check_rows(path, [f"line {number}" for number, _ in lines[1:]], columns)
+    return Cycle(
+        name=Path(path).stem,
+        time_s=columns["time_s"],
+        speed_mps=columns["speed_mps"],
+        grade=columns["grade"],
+        sha256=sha256_of(path),
+        path=str(path),
+    )
+
+
+def _fields(path: Path | str, number: int, line: str) -> list[str]:
+    try:
+        return next(csv.reader([line], strict=True))
+    except csv.Error as error:
+        raise ConfigError(path, f"line {number}", f"is no CSV: {error}") from None
+
+
+def _check_rows(path: Path | str, places: list[str], columns: dict[str, NDArray[np.float64]]) -> None:
+    if len(places) < 2:
+        raise ConfigError(path, "", f"has {len(places)} row(s)", "two or more")
+    for name, values in columns.items():
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            raise ConfigError(path, places[bad[0]], f"{name} {values[bad[0]]} is not finite")
+        if name in _RANGES:
+            low, high = _RANGES[name]
+            bad = np.flatnonzero((values < low) | (values > high))
+            if bad.size:
+                raise ConfigError(path, places[bad[0]], f"{name} {values[bad[0]]:g} is out of range", f"{low:g} to {high:g}")
+    back = np.flatnonzero(np.diff(columns["time_s"]) <= 0.0)
+    if back.size:
+        at = int(back[0]) + 1
+        before = columns["time_s"][at - 1]
+        raise ConfigError(path, places[at], f"time_s {columns['time_s'][at]:g} does not increase", f"> {before:g} s")

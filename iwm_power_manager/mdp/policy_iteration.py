@@ -1,0 +1,453 @@
+r"""Policy iteration (eq. 30, 31) that uses the problem's structure and stops on a certified bound.
+
+The Markov decision process
+---------------------------
+A state is (power demand p, previous share s, cell c), where a cell is a grid point (speed, front slip, rear slip).
+The demand is a Markov chain of its own; the next cell depends on (p, c, u) only; the next s is the control u. So
+
+    q(p, c, u) = cost(p, c, u) + gamma * sum_k weight_k * W[p, u, corner_k],     W = demand @ J
+    (T J)(p, s, c) = min_u  q(p, c, u) + switching(s, u)
+
+with the 8 corners of the grid cell the next (speed, slips) falls into. The only arrays of the size of state times
+control hold, per pair, a cost, the index of the lower corner and three fractions; no transition matrix is ever built,
+and the previous share multiplies the size of J but not the number of costs. Where skid avoidance leaves no choice
+(Table 2), a state has one action, which keeps s.
+
+The algorithm
+-------------
+Inexact policy iteration: improve the policy by T (eq. 31), then solve its evaluation (eq. 30), the linear system
+(I - gamma P_pi) J = c_pi, by BiCGSTAB without a matrix, only as accurately as the present distance to the optimum
+deserves: to `forcing` times the Bellman residual. `forcing` is tightened whenever the residual fails to shrink, so that
+the method falls back to exact policy iteration, which ends after finitely many policies.
+
+The bound
+---------
+Let d = T J - J, lo = min d, hi = max d (over all states). Then, for every state (MacQueen 1966, Porteus 1971),
+
+    T J + gamma / (1 - gamma) * lo  <=  J*  <=  T J + gamma / (1 - gamma) * hi
+
+so the midpoint of both is within gamma / (1 - gamma) * (hi - lo) / 2 of the optimal cost-to-go J* in the max norm, and
+the cost of the policy that is greedy for J exceeds J* by at most twice that. The iteration ends when this bound is
+at most `tolerance_j`.
+
+Every sum runs in a fixed order, whatever the number of threads: the same inputs give the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iwm_power_manager.jit import kernel, parallel_kernel
+from iwm_power_manager.mdp.threads import over_ranges
+
+#: Actions whose values differ by less than this, J, are equally good: rounding must not choose between them.
+TIE_J = 1e-6
+#: Policy entry of a state where skid avoidance leaves no choice.
+GATED = -1
+
+_BLOCK = 1024
+_FORCING = 0.03
+_MAX_KRYLOV_STEPS = 200
+
+
+class Model(NamedTuple):
+    """The discretised problem, stored by power demand p: all pairs of p lie together, control by control.
+
+    With n = free_start[p + 1] - free_start[p], pair (p, k-th free cell, u) stands at free_start[p] * n_u + u * n + k.
+
+    Attributes
+    ----------
+    discount : gamma
+    demand : float64[P, P], transition matrix of the power demand, rows sum to 1
+    cell_shape : points over (speed, slip front, slip rear); a cell's index is in C order
+    switching_j : float64[S, U], cost of share s -> u; S = 1 where the previous share is no state
+    free_start : int64[P + 1], first free cell of each power demand
+    free_cell : int32[N], cell of each state with a choice
+    free_cost : float64[N * U], J; infinite where the control is infeasible
+    free_corner : int32[N * U], lower corner of the next cell
+    free_fraction : float64[N * U, 3], place inside it, 0..1, over (speed, slip front, slip rear)
+    gated_start, gated_cell, gated_cost, gated_corner, gated_fraction : the same for states with a single action
+    """
+
+    discount: float
+    demand: NDArray[np.float64]
+    cell_shape: tuple[int, int, int]
+    switching_j: NDArray[np.float64]
+    free_start: NDArray[np.int64]
+    free_cell: NDArray[np.int32]
+    free_cost: NDArray[np.float64]
+    free_corner: NDArray[np.int32]
+    free_fraction: NDArray[np.float64]
+    gated_start: NDArray[np.int64]
+    gated_cell: NDArray[np.int32]
+    gated_cost: NDArray[np.float64]
+    gated_corner: NDArray[np.int32]
+    gated_fraction: NDArray[np.float64]
+
+    @property
+    def state_shape(self) -> tuple[int, int, int]:
+        """Number of (power demands, previous shares, cells)."""
+        return self.demand.shape[0], self.switching_j.shape[0], int(np.prod(self.cell_shape))
+
+
+class Iteration(NamedTuple):
+    """One policy of the iteration, as printed and stored (the paper's Fig. 12).
+
+    Attributes
+    ----------
+    number : 1 for the first policy
+    evaluation_sweeps : applications of the transition operator so far
+    bound_j : certified max-norm distance of the cost-to-go from the optimal one, J
+    policy_change : Euclidean norm of the change of the front share over all states
+    changed_states : number of states whose front share changed
+    """
+
+    number: int
+    evaluation_sweeps: int
+    bound_j: float
+    policy_change: float
+    changed_states: int
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The solved problem.
+
+    Attributes
+    ----------
+    cost_j : float64[P, S, C], cost-to-go, J, within `bound_j` of the optimum
+    policy : int16[P, S, C], index of the control, or GATED
+    bound_j : certified max-norm bound, J
+    converged : whether bound_j <= tolerance_j
+    iterations : one entry a policy
+    """
+
+    cost_j: NDArray[np.float64]
+    policy: NDArray[np.int16]
+    bound_j: float
+    converged: bool
+    iterations: tuple[Iteration, ...]
+
+
+def split_cells(gated: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
+    """Start and cell lists of the free and of the gated states (see `Model`) from gated[P, C]."""
+    lists = []
+    for mask in (~gated, gated):
+        start = np.zeros(mask.shape[0] + 1, dtype=np.int64)
+        start[1:] = np.cumsum(mask.sum(axis=1))
+        lists += [start, np.nonzero(mask)[1].astype(np.int32)]
+    return tuple(lists)  # type: ignore[return-value]
+
+
+@kernel
+def corner_steps(cell_shape):
+    """Index steps from a cell's lower corner to its neighbours; 0 along an axis of a single point."""
+    n_v, n_f, n_r = cell_shape
+    return (n_f * n_r if n_v > 1 else 0, n_r if n_f > 1 else 0, 1 if n_r > 1 else 0)
+
+
+@kernel
+def _interpolate(w, corner, step_v, step_f, step_r, a, b, c):
+    low = (1.0 - b) * ((1.0 - c) * w[corner] + c * w[corner + step_r]) + b * (
+        (1.0 - c) * w[corner + step_f] + c * w[corner + step_f + step_r]
+    )
+    corner += step_v
+    high = (1.0 - b) * ((1.0 - c) * w[corner] + c * w[corner + step_r]) + b * (
+        (1.0 - c) * w[corner + step_f] + c * w[corner + step_f + step_r]
+    )
+    return (1.0 - a) * low + a * high
+
+
+@parallel_kernel
+def expect_over_demand(demand, cost, first_column, last_column, out):
+    """out[p] = sum over q of demand[p, q] * cost[q] in a range of columns; arrays [P, n], summed in the order of q."""
+    for first in range(first_column, last_column, _BLOCK):
+        last = min(first + _BLOCK, last_column)
+        for p in range(demand.shape[0]):
+            out[p, first:last] = 0.0
+            for q in range(demand.shape[1]):
+                weight = demand[p, q]
+                if weight != 0.0:
+                    for i in range(first, last):
+                        out[p, i] += weight * cost[q, i]
+
+
+@parallel_kernel
+def improve(model, w, first_power, last_power, out, policy):
+    """The Bellman operator for a range of power demands: out = T J and its greedy policy, from w = demand @ J.
+
+    Among controls that are equally good (to TIE_J), staying at the previous share wins; without one, the largest front
+    share: braking in front is the stable choice.
+    """
+    n_u = model.switching_j.shape[1]
+    n_s = model.switching_j.shape[0]
+    tracked = n_s > 1
+    step_v, step_f, step_r = corner_steps(model.cell_shape)
+    gamma = model.discount
+    for p in range(first_power, last_power):
+        first = model.free_start[p]
+        n = model.free_start[p + 1] - first
+        value = np.empty((n_u, n))
+        for u in range(n_u):
+            ahead = w[p, u if tracked else 0]
+            base = first * n_u + u * n
+            for k in range(n):
+                i = base + k
+                value[u, k] = model.free_cost[i] + gamma * _interpolate(
+                    ahead,
+                    model.free_corner[i],
+                    step_v,
+                    step_f,
+                    step_r,
+                    model.free_fraction[i, 0],
+                    model.free_fraction[i, 1],
+                    model.free_fraction[i, 2],
+                )
+        best = np.empty(n)
+        chosen_value = np.empty(n)
+        chosen = np.empty(n, np.int16)
+        for s in range(n_s):
+            favourite = s if tracked else n_u - 1
+            for k in range(n):
+                best[k] = chosen_value[k] = value[favourite, k] + model.switching_j[s, favourite]
+                chosen[k] = favourite
+            for u in range(n_u - 1, -1, -1):
+                price = model.switching_j[s, u]
+                for k in range(n):
+                    candidate = value[u, k] + price
+                    best[k] = min(best[k], candidate)
+                    if candidate < chosen_value[k] - TIE_J:
+                        chosen_value[k] = candidate
+                        chosen[k] = u
+            for k in range(n):
+                cell = model.free_cell[first + k]
+                out[p, s, cell] = best[k]
+                policy[p, s, cell] = chosen[k]
+        _gated(model, w, 1.0, p, out)
+        for i in range(model.gated_start[p], model.gated_start[p + 1]):
+            for s in range(n_s):
+                policy[p, s, model.gated_cell[i]] = GATED
+
+
+@parallel_kernel
+def apply_policy(model, w, policy, cost_factor, first_power, last_power, out):
+    """out = cost_factor * c_pi + gamma * P_pi J for a range of power demands, from w = demand @ J."""
+    n_u = model.switching_j.shape[1]
+    n_s = model.switching_j.shape[0]
+    tracked = n_s > 1
+    step_v, step_f, step_r = corner_steps(model.cell_shape)
+    gamma = model.discount
+    for p in range(first_power, last_power):
+        first = model.free_start[p]
+        n = model.free_start[p + 1] - first
+        for s in range(n_s):
+            for k in range(n):
+                cell = model.free_cell[first + k]
+                u = policy[p, s, cell]
+                i = first * n_u + u * n + k
+                out[p, s, cell] = cost_factor * (model.free_cost[i] + model.switching_j[s, u]) + gamma * _interpolate(
+                    w[p, u if tracked else 0],
+                    model.free_corner[i],
+                    step_v,
+                    step_f,
+                    step_r,
+                    model.free_fraction[i, 0],
+                    model.free_fraction[i, 1],
+                    model.free_fraction[i, 2],
+                )
+        _gated(model, w, cost_factor, p, out)
+
+
+@kernel
+def _gated(model, w, cost_factor, p, out):
+    step_v, step_f, step_r = corner_steps(model.cell_shape)
+    for s in range(model.switching_j.shape[0]):
+        ahead = w[p, s]
+        for i in range(model.gated_start[p], model.gated_start[p + 1]):
+            out[p, s, model.gated_cell[i]] = cost_factor * model.gated_cost[i] + model.discount * _interpolate(
+                ahead,
+                model.gated_corner[i],
+                step_v,
+                step_f,
+                step_r,
+                model.gated_fraction[i, 0],
+                model.gated_fraction[i, 1],
+                model.gated_fraction[i, 2],
+            )
+
+
+@kernel
+def dot(a, b):
+    """Scalar product of two vectors, summed in a fixed order: BLAS's depends on the number of threads."""
+    total = 0.0
+    for first in range(0, a.size, _BLOCK):
+        # Four running sums keep the adder busy; blocks keep the rounding error small.
+        s0 = s1 = s2 = s3 = 0.0
+        last = min(first + _BLOCK, a.size)
+        whole = first + (last - first) // 4 * 4
+        for i in range(first, whole, 4):
+            s0 += a[i] * b[i]
+            s1 += a[i + 1] * b[i + 1]
+            s2 += a[i + 2] * b[i + 2]
+            s3 += a[i + 3] * b[i + 3]
+        for i in range(whole, last):
+            s0 += a[i] * b[i]
+        total += (s0 + s1) + (s2 + s3)
+    return total
+
+
+class _Operator:
+    """demand @ J and the two operators on it, with the work array they share."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.ahead = np.empty(model.state_shape)
+        self.sweeps = 0
+
+    def _expect(self, cost: NDArray[np.float64]) -> None:
+        rows = cost.shape[0]
+        flat, ahead = cost.reshape(rows, -1), self.ahead.reshape(rows, -1)
+        over_ranges(
+            flat.shape[1], lambda first, last: expect_over_demand(self.model.demand, flat, first, last, ahead)
+        )
+        self.sweeps += 1
+
+    def improve(self, cost: NDArray[np.float64], out: NDArray[np.float64], policy: NDArray[np.int16]) -> None:
+        self._expect(cost)
+        over_ranges(
+            cost.shape[0], lambda first, last: improve(self.model, self.ahead, first, last, out, policy)
+        )
+
+    def evaluate(
+        self, cost: NDArray[np.float64], policy: NDArray[np.int16], cost_factor: float, out: NDArray[np.float64]
+    ) -> None:
+        self._expect(cost)
+        over_ranges(
+            cost.shape[0],
+            lambda first, last: apply_policy(self.model, self.ahead, policy, cost_factor, first, last, out),
+        )
+
+
+def _evaluate_policy(operator: _Operator, policy: NDArray[np.int16], cost: NDArray[np.float64], target: float) -> None:
+    """Solve (I - gamma P_pi) cost = c_pi in place, from the given start, until the residual's max norm is <= target.
+
+    BiCGSTAB (van der Vorst 1992); it is restarted from the best point so far when it breaks down.
+    """
+    residual = np.empty_like(cost)
+    image = np.empty_like(cost)
+    second = np.empty_like(cost)
+
+    def true_residual() -> float:
+        operator.evaluate(cost, policy, 1.0, residual)
+        np.subtract(residual, cost, out=residual)
+        return float(np.max(np.abs(residual)))
+
+    def multiply(vector: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        operator.evaluate(vector, policy, 0.0, out)
+        np.subtract(vector, out, out=out)
+
+    for _ in range(_MAX_KRYLOV_STEPS):
+        if true_residual() <= target:
+            return
+        shadow = residual.copy()
+        direction = residual.copy()
+        rho = dot(shadow.ravel(), residual.ravel())
+        for _ in range(_MAX_KRYLOV_STEPS):
+            multiply(direction, image)
+            denominator = dot(shadow.ravel(), image.ravel())
+            if denominator == 0.0:
+                break
+            step = rho / denominator
+            residual -= step * image
+            multiply(residual, second)
+            squared = dot(second.ravel(), second.ravel())
+            omega = dot(second.ravel(), residual.ravel()) / squared if squared > 0.0 else 0.0
+            cost += step * direction
+            cost += omega * residual
+            residual -= omega * second
+            if float(np.max(np.abs(residual))) <= target:
+                break
+            rho_next = dot(shadow.ravel(), residual.ravel())
+            if omega == 0.0 or rho == 0.0 or not np.isfinite(rho_next):
+                break
+            factor = rho_next / rho * (step / omega)
+            direction -= omega * image
+            direction *= factor
+            direction += residual
+            rho = rho_next
+
+
+def certified_bound(discount: float, difference: NDArray[np.float64]) -> tuple[float, float]:
+    """Shift and max-norm bound (J) from the Bellman difference T J - J: J* = T J + shift, give or take the bound."""
+    low, high = float(np.min(difference)), float(np.max(difference))
+    factor = discount / (1.0 - discount)
+    return factor * (low + high) / 2.0, factor * (high - low) / 2.0
+
+
+def solve(
+    model: Model,
+    share: NDArray[np.float64],
+    tolerance_j: float,
+    max_iterations: int = 100,
+    progress: Callable[[Iteration], None] | None = None,
+) -> Solution:
+    """Solve the problem to a certified bound.
+
+    Parameters
+    ----------
+    model : the discretised problem
+    share : float64[U], front share of each control, for the norm of the policy's change
+    tolerance_j : bound on the max-norm distance from the optimal cost-to-go, J
+    max_iterations : policies to try at most
+    progress : called after each policy
+
+    Returns
+    -------
+    Solution
+        `converged` is False where max_iterations, or the precision of the arithmetic, ended the iteration first.
+    """
+    operator = _Operator(model)
+    cost = np.zeros(model.state_shape)
+    improved = np.empty_like(cost)
+    policy = np.full(cost.shape, GATED, dtype=np.int16)
+    previous = np.empty_like(policy)
+    history: list[Iteration] = []
+    share_of = np.append(share, 0.0)  # the last entry serves GATED = -1
+    residual_target = tolerance_j * (1.0 - model.discount) / model.discount if model.discount > 0.0 else np.inf
+    forcing = _FORCING
+    smallest = np.inf
+    while True:
+        previous[:] = policy
+        operator.improve(cost, improved, policy)
+        difference = np.subtract(improved, cost, out=cost)
+        residual = float(np.max(np.abs(difference)))
+        shift, bound = certified_bound(model.discount, difference)
+        change = share_of[policy] - share_of[previous] if history else share_of[policy]
+        history.append(
+            Iteration(
+                number=len(history) + 1,
+                evaluation_sweeps=operator.sweeps,
+                bound_j=bound,
+                policy_change=float(np.sqrt(np.sum(change * change))),
+                changed_states=int(np.count_nonzero(policy != previous)),
+            )
+        )
+        if progress is not None:
+            progress(history[-1])
+        if bound <= tolerance_j or len(history) == max_iterations:
+            break
+        if bound > 0.9 * smallest:
+            forcing *= 0.1
+            if forcing < 1e-12:
+                break
+        smallest = min(smallest, bound)
+        cost, improved = improved, cost
+        cost += shift
+        _evaluate_policy(operator, policy, cost, max(forcing * residual, 0.1 * residual_target))
+    improved += shift
+    return Solution(improved, policy, bound, bound <= tolerance_j, tuple(history))

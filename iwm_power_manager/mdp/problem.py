@@ -1,0 +1,282 @@
+"""The optimisation problem: state and control grids, and what a step costs.
+
+State x = (power demand, speed, slip of the front axle, slip of the rear axle[, previous front share]), eq. 32-37.
+Control: the front share u of the demand, P_f = u * P_dem. Cost of a step in joules of battery energy (eq. 28):
+
+    xi = battery energy + alpha * power error * dt + switching cost of |u - previous u|
+
+A problem file is YAML; `load_problem` checks every value of it. An axis may have a single point, and then the problem
+does not depend on that state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import (
+    check_bool,
+    check_choice,
+    check_integer,
+    check_keys,
+    check_number,
+    dotted,
+    read_yaml,
+)
+
+FORMAT = 1
+
+#: Where the delivered power is measured: torque times speed at the wheel (sees no power lost in slip), or at the
+#: road, where it moves the car.
+POWER_ERROR_WHEEL, POWER_ERROR_ROAD = range(2)
+POWER_ERRORS = {"wheel": POWER_ERROR_WHEEL, "road": POWER_ERROR_ROAD}
+
+#: What an error e (W, demanded minus delivered) costs per second, in W:
+#: squared alpha * e^2 / 1 kW; absolute alpha * |e|; lagrange alpha * e towards the demand, so that a surplus is
+#: credited: the multiplier of "deliver the demand on average".
+ERROR_SQUARED, ERROR_ABSOLUTE, ERROR_LAGRANGE = range(3)
+ERROR_NORMS = {"squared": ERROR_SQUARED, "absolute": ERROR_ABSOLUTE, "lagrange": ERROR_LAGRANGE}
+
+#: dynamic: slip is a state and obeys wheel rotation (eq. 11). quasi_steady: slip settles within a step at the value
+#: that carries the axle's force; slip is no state then.
+SLIP_DYNAMIC, SLIP_QUASI_STEADY = range(2)
+SLIP_MODELS = {"dynamic": SLIP_DYNAMIC, "quasi_steady": SLIP_QUASI_STEADY}
+
+#: Skid avoidance inside the problem (Table 2): none; an axle beyond the critical slip in braking gets no power;
+#: or in driving as well.
+SKID_NONE, SKID_BRAKING, SKID_BOTH = range(3)
+SKID_AVOIDANCE = {"none": SKID_NONE, "braking": SKID_BRAKING, "both": SKID_BOTH}
+
+MAX_AXIS_POINTS = 1000
+#: State-control pairs: beyond it the solver would need gigabytes.
+MAX_PAIRS = 20_000_000
+
+
+class ProblemParams(NamedTuple):
+    """What the kernels need to know of the problem; all SI.
+
+    Attributes
+    ----------
+    dt_s : length of a decision step
+    friction : peak friction coefficient of the road
+    alpha : price of undelivered energy, J per J (squared: at an error of 1 kW)
+    power_error : POWER_ERROR_*
+    error_norm : ERROR_*
+    slip_model : SLIP_*
+    skid_avoidance : SKID_*
+    critical_slip : magnitude of slip beyond which an axle is gated
+    """
+
+    dt_s: float
+    friction: float
+    alpha: float
+    power_error: int
+    error_norm: int
+    slip_model: int
+    skid_avoidance: int
+    critical_slip: float
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A checked problem file.
+
+    Attributes
+    ----------
+    name : the file's name without its ending
+    power_w, speed_mps, slip_front, slip_rear : state axes, float64, strictly increasing
+    share : control levels, 0..1; also the axis of the previous share
+    previous_share : whether the previous share is a state
+    dt_s : length of a step
+    discount : gamma, 0 < gamma < 1
+    alpha, power_error, error_norm, slip_model, skid_avoidance, critical_slip : see `ProblemParams`, codes by name
+    switching_cost_j : cost of moving the whole power from one axle to the other, proportional to |change of share|
+    switching_fixed_cost_j : cost of any change at all
+    tolerance_j : solve until the cost-to-go is certified to be this close to the optimal one, J
+    max_iterations : give up after this many policies
+    """
+
+    name: str
+    power_w: NDArray[np.float64]
+    speed_mps: NDArray[np.float64]
+    slip_front: NDArray[np.float64]
+    slip_rear: NDArray[np.float64]
+    share: NDArray[np.float64]
+    previous_share: bool
+    dt_s: float
+    discount: float
+    alpha: float
+    power_error: str
+    error_norm: str
+    slip_model: str
+    skid_avoidance: str
+    critical_slip: float
+    switching_cost_j: float
+    switching_fixed_cost_j: float
+    tolerance_j: float
+    max_iterations: int
+
+    def params(self, friction: float) -> ProblemParams:
+        """The numbers the kernels take, for one road."""
+        return ProblemParams(
+            dt_s=self.dt_s,
+            friction=float(friction),
+            alpha=self.alpha,
+            power_error=POWER_ERRORS[self.power_error],
+            error_norm=ERROR_NORMS[self.error_norm],
+            slip_model=SLIP_MODELS[self.slip_model],
+            skid_avoidance=SKID_AVOIDANCE[self.skid_avoidance],
+            critical_slip=self.critical_slip,
+        )
+
+    @property
+    def previous_shares(self) -> NDArray[np.float64]:
+        """Axis of the previous share: the control levels, or a single point where it is no state."""
+        return self.share if self.previous_share else np.zeros(1)
+
+    @property
+    def shape(self) -> tuple[int, int, int, int, int]:
+        """Number of points over (power, speed, slip front, slip rear, previous share)."""
+        return (
+            self.power_w.size,
+            self.speed_mps.size,
+            self.slip_front.size,
+            self.slip_rear.size,
+            self.previous_shares.size,
+        )
+
+    def switching_cost(self) -> NDArray[np.float64]:
+        """Cost in J of going from a previous share (rows) to a share (columns)."""
+        change = np.abs(self.previous_shares[:, None] - self.share[None, :])
+        if not self.previous_share:
+            return np.zeros_like(change)
+        return self.switching_cost_j * change + self.switching_fixed_cost_j * (change > 0.0)
+
+    def settings(self) -> dict[str, Any]:
+        """Every setting by name, as plain values: what a policy file records."""
+        return {
+            field.name: value.tolist() if isinstance(value := getattr(self, field.name), np.ndarray) else value
+            for field in dataclasses.fields(self)
+        }
+
+
+_AXES = {  # axis: (low, high, unit)
+    "power_w": (-1e6, 1e6, "W"),
+    "speed_mps": (0.0, 100.0, "m/s"),
+    "slip_front": (-1.0, 1.0, ""),
+    "slip_rear": (-1.0, 1.0, ""),
+    "share": (0.0, 1.0, ""),
+}
+_REQUIRED = ("format", *_AXES, "dt_s", "discount", "alpha")
+_OPTIONAL = (
+    "previous_share",
+    "power_error",
+    "error_norm",
+    "slip_model",
+    "skid_avoidance",
+    "critical_slip",
+    "switching_cost_j",
+    "switching_fixed_cost_j",
+    "tolerance_j",
+    "max_iterations",
+)
+
+
+def load_problem(path: Path | str) -> Problem:
+    """Read and check a problem file (`config/grids/*.yaml`).
+
+    Raises
+    ------
+    ConfigError
+        Anything unreadable, unknown, missing, of the wrong type or out of range, or a combination without meaning.
+    """
+    return problem_from(read_yaml(path), path)
+
+
+def problem_from(content: Any, path: Path | str) -> Problem:
+    """A `Problem` from the mapping a problem file holds; `path` is what errors name."""
+    check_keys(path, content, _REQUIRED, _OPTIONAL)
+    check_integer(path, "format", content["format"], FORMAT, FORMAT)
+    axes = {key: read_axis(path, key, content[key], *limits) for key, limits in _AXES.items()}
+    problem = Problem(
+        name=Path(path).stem,
+        **axes,
+        previous_share=check_bool(path, "previous_share", content.get("previous_share", False)),
+        dt_s=check_number(path, "dt_s", content["dt_s"], 0.001, 10.0, unit="s"),
+        discount=check_number(path, "discount", content["discount"], 0.0, 0.9999),
+        alpha=check_number(path, "alpha", content["alpha"], 0.0, 1e6),
+        power_error=check_choice(path, "power_error", content.get("power_error", "road"), POWER_ERRORS),
+        error_norm=check_choice(path, "error_norm", content.get("error_norm", "absolute"), ERROR_NORMS),
+        slip_model=check_choice(path, "slip_model", content.get("slip_model", "dynamic"), SLIP_MODELS),
+        skid_avoidance=check_choice(path, "skid_avoidance", content.get("skid_avoidance", "braking"), SKID_AVOIDANCE),
+        critical_slip=check_number(path, "critical_slip", content.get("critical_slip", 0.2), 0.01, 1.0),
+        switching_cost_j=check_number(path, "switching_cost_j", content.get("switching_cost_j", 0.0), 0.0, 1e6, unit="J"),
+        switching_fixed_cost_j=check_number(
+            path, "switching_fixed_cost_j", content.get("switching_fixed_cost_j", 0.0), 0.0, 1e6, unit="J"
+        ),
+        tolerance_j=check_number(path, "tolerance_j", content.get("tolerance_j", 0.01), 1e-6, 1e6, unit="J"),
+        max_iterations=check_integer(path, "max_iterations", content.get("max_iterations", 100), 1, 10_000),
+    )
+    _check_combination(problem, path)
+    return problem
+
+
+def _check_combination(problem: Problem, path: Path | str) -> None:
+    if problem.slip_model == "quasi_steady":
+        for key in ("slip_front", "slip_rear"):
+            axis = getattr(problem, key)
+            if axis.size != 1 or axis[0] != 0.0:
+                raise ConfigError(path, key, "is no state with slip_model quasi_steady", "[0]")
+    if not problem.previous_share:
+        for key in ("switching_cost_j", "switching_fixed_cost_j"):
+            if getattr(problem, key) > 0.0:
+                raise ConfigError(path, key, "needs previous_share: true", "0, or previous_share: true")
+    pairs = int(np.prod([float(n) for n in problem.shape[:4]])) * problem.share.size
+    if pairs > MAX_PAIRS:
+        raise ConfigError(path, "", f"has {pairs:.3g} pairs of state and control", f"<= {MAX_PAIRS:.3g}: use coarser axes")
+
+
+def read_axis(file: Path | str, key: str, value: Any, low: float, high: float, unit: str) -> NDArray[np.float64]:
+    """An axis from a list of numbers, from `{from, to, step}`, or from `{mirrored: [0, a, b, ...]}`.
+
+    Raises
+    ------
+    ConfigError
+        It is empty, too long, not strictly increasing, or has a point that is no number or outside low..high.
+    """
+    if isinstance(value, dict) and "mirrored" in value:
+        check_keys(file, value, ("mirrored",), parent=key)
+        half = _points(file, dotted(key, "mirrored"), value["mirrored"], max(low, 0.0), high, unit)
+        points = np.concatenate([-half[::-1], half[1:] if half[0] == 0.0 else half])
+    elif isinstance(value, dict):
+        check_keys(file, value, ("from", "to", "step"), parent=key)
+        first = check_number(file, dotted(key, "from"), value["from"], low, high, unit=unit)
+        last = check_number(file, dotted(key, "to"), value["to"], first, high, unit=unit)
+        step = check_number(file, dotted(key, "step"), value["step"], 0.0, high - low, above=True, unit=unit)
+        intervals = round((last - first) / step)
+        if abs(first + intervals * step - last) > 1e-6 * step:
+            raise ConfigError(file, dotted(key, "step"), f"{step:g} does not divide {first:g} to {last:g}")
+        if intervals >= MAX_AXIS_POINTS:
+            raise ConfigError(file, dotted(key, "step"), f"{step:g} gives {intervals + 1} points", f"<= {MAX_AXIS_POINTS}")
+        # Whole multiples, rounded: 0.1 * 3 must be the 0.3 that a list would hold.
+        points = np.array([float(f"{first + i * step:.12g}") for i in range(intervals + 1)])
+    else:
+        points = _points(file, key, value, low, high, unit)
+    if points.size > MAX_AXIS_POINTS:
+        raise ConfigError(file, key, f"has {points.size} points", f"<= {MAX_AXIS_POINTS}")
+    return points + 0.0  # -0.0 becomes 0.0
+
+
+def _points(file: Path | str, key: str, value: Any, low: float, high: float, unit: str) -> NDArray[np.float64]:
+    if not isinstance(value, list) or not value:
+        raise ConfigError(file, key, f"{value!r} is no axis", "[a, b, ...], {from, to, step} or {mirrored: [0, a, ...]}")
+    points = np.array([check_number(file, f"{key}[{i}]", x, low, high, unit=unit) for i, x in enumerate(value)])
+    for i in np.flatnonzero(np.diff(points) <= 0.0):
+        raise ConfigError(file, f"{key}[{i + 1}]", f"{value[i + 1]} does not increase", f"> {value[i]}")
+    return points

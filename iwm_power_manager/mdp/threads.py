@@ -1,0 +1,35 @@
+"""Spread a kernel over the cores: separate ranges of its output, each written by one thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numba
+
+#: More ranges than threads, so that one slow range does not leave the other cores idle.
+_RANGES_PER_THREAD = 6
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    # numba's count honours both the process's CPU affinity and NUMBA_NUM_THREADS.
+    return ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, thread_name_prefix="solver")
+
+
+def over_ranges(size: int, function: Callable[[int, int], None]) -> None:
+    """Call function(first, last) for consecutive ranges that cover 0..size; return when all are done.
+
+    `function` calls a `parallel_kernel` whose output in a range depends on nothing written in another one: then the
+    result is the same for any number of threads.
+    """
+    threads = numba.config.NUMBA_NUM_THREADS
+    count = min(size, threads * _RANGES_PER_THREAD) if threads > 1 else 1
+    edges = [size * i // count for i in range(count + 1)] if count else [0]
+    if count <= 1:
+        function(0, size)
+        return
+    futures = [_pool().submit(function, low, high) for low, high in zip(edges, edges[1:], strict=False)]
+    for future in futures:
+        future.result()

@@ -1,0 +1,485 @@
+"""The policy file: write it, verify it, and hand its tables to the control law.
+
+A policy is one `.npz` without pickles. Its members:
+
+=====================  ==========================================================================================
+front_share            float64[P, V, F, R, S], the control of every state: P_front / P_demand
+cost_j                 float64[P, V, F, R, S], cost-to-go, J, rounded to a power of two below the tolerance
+demand_probability     float64[P, P], transition matrix of the power demand
+demand_steps           float64[P], (weighted) steps counted in each of its rows
+metadata               JSON text as bytes: format, versions, vehicle with its hash, cycles with theirs, friction, every
+                       setting of the problem (with the axes), and the solver's iterations and bound
+checksum               SHA-256 over all of the above
+=====================  ==========================================================================================
+
+The axes are power demand, speed, slip front, slip rear and previous front share. The same policy always gives the same
+bytes: no time, path or thread count is in the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import math
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iwm_power_manager import __version__
+from iwm_power_manager.errors import ConfigError, PolicyError
+from iwm_power_manager.files import atomic_write, read_bytes
+from iwm_power_manager.mdp.demand import DemandChain, Source
+from iwm_power_manager.mdp.policy_iteration import GATED, Iteration, Solution, expect_over_demand
+from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
+from iwm_power_manager.mdp.problem import (
+    ERROR_ABSOLUTE,
+    POWER_ERROR_ROAD,
+    SKID_BRAKING,
+    SLIP_QUASI_STEADY,
+    Problem,
+    ProblemParams,
+    problem_from,
+)
+from iwm_power_manager.mdp.transitions import axles_gated
+from iwm_power_manager.vehicle import Vehicle
+
+FORMAT_NAME = "iwm_power_manager policy"
+FORMAT_VERSION = 1
+
+_ARRAYS = ("front_share", "cost_j", "demand_probability", "demand_steps")
+_MEMBERS = (*_ARRAYS, "metadata", "checksum")
+_MAX_BYTES = 2**31
+#: Zip's earliest date: a file's bytes must not depend on when it was written.
+_ZIP_DATE = (1980, 1, 1, 0, 0, 0)
+
+
+class PolicyTable(NamedTuple):
+    """A policy as the control law takes it. Axes: P power, V speed, F slip front, R slip rear, S previous share.
+
+    Attributes
+    ----------
+    power_w, speed_mps, slip_front, slip_rear, previous_share : axes; S has one point where the previous share is no state
+    share : control levels, 0..1
+    front_share : float64[P, V, F, R, S]
+    expected_cost_j : float64[P, V, F, R, S], expected cost-to-go after a step: E[J(next demand, v, f, r, s) | P]
+    discount : gamma
+    switching_cost_j, switching_fixed_cost_j : price of a change of share: per unit, and of any change
+    problem : what `step_cost_and_next` needs
+    rule : coefficients of the `rule` strategy: P_f = rule[0] + rule[1] * P_dem driving, rule[2:4] braking
+    schedule : front share of each decision, for the `preview` strategy
+    """
+
+    power_w: NDArray[np.float64]
+    speed_mps: NDArray[np.float64]
+    slip_front: NDArray[np.float64]
+    slip_rear: NDArray[np.float64]
+    previous_share: NDArray[np.float64]
+    share: NDArray[np.float64]
+    front_share: NDArray[np.float64]
+    expected_cost_j: NDArray[np.float64]
+    discount: float
+    switching_cost_j: float
+    switching_fixed_cost_j: float
+    problem: ProblemParams
+    rule: NDArray[np.float64]
+    schedule: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A solved policy with all it was made from.
+
+    Attributes
+    ----------
+    problem : grids and settings
+    friction : peak friction coefficient it was solved for
+    front_share, cost_j : float64[P, V, F, R, S]
+    chain : the demand's Markov chain
+    vehicle_name, vehicle_hash, idle_drive : the car it was solved for
+    sources : of the demand: name, sha256, weight, steps
+    iterations : of the solver (the paper's Fig. 12)
+    bound_j : certified max-norm distance of `cost_j` from the optimal cost-to-go
+    converged : whether bound_j is within the problem's tolerance
+    package_version : that solved it
+    checksum : SHA-256 of the content, 64 hex digits: the policy's identity
+    """
+
+    problem: Problem
+    friction: float
+    front_share: NDArray[np.float64]
+    cost_j: NDArray[np.float64]
+    chain: DemandChain
+    vehicle_name: str
+    vehicle_hash: str
+    idle_drive: str
+    sources: tuple[Mapping[str, Any], ...]
+    iterations: tuple[Iteration, ...]
+    bound_j: float
+    converged: bool
+    package_version: str
+    checksum: str
+
+    def check_vehicle(self, vehicle: Vehicle, name: str = "policy") -> None:
+        """Raise `PolicyError` unless this policy was solved for exactly this car (any change of a number counts)."""
+        if self.vehicle_hash != vehicle.hash:
+            raise PolicyError(
+                f"{name}: was solved for '{self.vehicle_name}' ({self.vehicle_hash}, idle_drive {self.idle_drive}), "
+                f"not for '{vehicle.name}' ({vehicle.hash}, idle_drive {vehicle.idle_drive}); "
+                "solve one for this car with solve_policy"
+            )
+
+    def table(self, rule: Sequence[float] = (), schedule: Sequence[float] = ()) -> PolicyTable:
+        """The numbers for the control law."""
+        problem = self.problem
+        rows = problem.power_w.size
+        cost = np.ascontiguousarray(self.cost_j).reshape(rows, -1)
+        ahead = np.empty_like(cost)
+        expect_over_demand(self.chain.probability, cost, 0, cost.shape[1], ahead)
+        return PolicyTable(
+            power_w=problem.power_w,
+            speed_mps=problem.speed_mps,
+            slip_front=problem.slip_front,
+            slip_rear=problem.slip_rear,
+            previous_share=problem.previous_shares,
+            share=problem.share,
+            front_share=np.ascontiguousarray(self.front_share),
+            expected_cost_j=ahead.reshape(problem.shape),
+            discount=problem.discount,
+            switching_cost_j=problem.switching_cost_j,
+            switching_fixed_cost_j=problem.switching_fixed_cost_j,
+            problem=problem.params(self.friction),
+            rule=_vector(rule, 4),
+            schedule=_vector(schedule, 1),
+        )
+
+
+def empty_table(
+    share: Sequence[float] | None = None, rule: Sequence[float] = (), schedule: Sequence[float] = ()
+) -> PolicyTable:
+    """A `PolicyTable` for strategies that need no solved policy: its tables hold equal split and no cost."""
+    point = np.zeros(1)
+    levels = np.arange(21) / 20.0 if share is None else np.ascontiguousarray(share, dtype=np.float64)
+    return PolicyTable(
+        power_w=point,
+        speed_mps=point,
+        slip_front=point,
+        slip_rear=point,
+        previous_share=point,
+        share=levels,
+        front_share=np.full((1, 1, 1, 1, 1), 0.5),
+        expected_cost_j=np.zeros((1, 1, 1, 1, 1)),
+        discount=0.0,
+        switching_cost_j=0.0,
+        switching_fixed_cost_j=0.0,
+        problem=ProblemParams(
+            dt_s=0.1,
+            friction=0.9,
+            alpha=0.0,
+            power_error=POWER_ERROR_ROAD,
+            error_norm=ERROR_ABSOLUTE,
+            slip_model=SLIP_QUASI_STEADY,
+            skid_avoidance=SKID_BRAKING,
+            critical_slip=0.2,
+        ),
+        rule=_vector(rule, 4),
+        schedule=_vector(schedule, 1),
+    )
+
+
+def _vector(values: Sequence[float], least: int) -> NDArray[np.float64]:
+    """`values` as float64[:]; where there are none, equal split, long enough for the law to read."""
+    if len(values):
+        return np.ascontiguousarray(values, dtype=np.float64)
+    return np.array([0.0, 0.5, 0.0, 0.5]) if least == 4 else np.full(least, 0.5)
+
+
+def cost_quantum_j(tolerance_j: float) -> float:
+    """Step to which the stored cost-to-go is rounded: the largest power of two up to an eighth of the tolerance.
+
+    Rounding makes the file a third of its size and hides the last bits, in which mathematical libraries differ.
+    """
+    return 2.0 ** math.floor(math.log2(tolerance_j / 8.0))
+
+
+def make_policy(
+    problem: Problem,
+    vehicle: Vehicle,
+    friction: float,
+    chain: DemandChain,
+    sources: Sequence[Source],
+    solution: Solution,
+) -> Policy:
+    """A `Policy` from a solution. Its bound includes the rounding of the cost-to-go."""
+    quantum = cost_quantum_j(problem.tolerance_j)
+    powers, shares, cells = solution.cost_j.shape
+    cost = np.round(solution.cost_j / quantum) * quantum + 0.0
+    bound = solution.bound_j + quantum / 2.0
+    front_share = np.append(problem.share, np.nan)[solution.policy]
+    gated = solution.policy == GATED
+    if problem.previous_share:
+        front_share[gated] = np.broadcast_to(problem.share[None, :, None], gated.shape)[gated]
+    else:
+        params = problem.params(friction)
+        f, r = problem.slip_front.size, problem.slip_rear.size
+        for p, _, c in np.argwhere(gated):
+            front, rear = axles_gated(
+                problem.power_w[p], problem.slip_front[c // r % f], problem.slip_rear[c % r], params
+            )
+            front_share[p, 0, c] = 0.5 if front and rear else 0.0 if front else 1.0
+
+    def table(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.ascontiguousarray(values.transpose(0, 2, 1)).reshape(problem.shape)
+
+    policy = Policy(
+        problem=problem,
+        friction=float(friction),
+        front_share=table(front_share),
+        cost_j=table(cost),
+        chain=chain,
+        vehicle_name=vehicle.name,
+        vehicle_hash=vehicle.hash,
+        idle_drive=vehicle.idle_drive,
+        sources=tuple(
+            {"name": s.name, "sha256": s.sha256, "weight": float(s.weight), "steps": s.steps} for s in sources
+        ),
+        iterations=solution.iterations,
+        bound_j=bound,
+        converged=bool(bound <= problem.tolerance_j),
+        package_version=__version__,
+        checksum="",
+    )
+    return _with_checksum(policy)
+
+
+def _with_checksum(policy: Policy) -> Policy:
+    arrays, metadata = _content(policy)
+    return dataclasses.replace(policy, checksum=_checksum(arrays, metadata))
+
+
+def _content(policy: Policy) -> tuple[dict[str, NDArray[np.float64]], bytes]:
+    arrays = {
+        "front_share": policy.front_share,
+        "cost_j": policy.cost_j,
+        "demand_probability": policy.chain.probability,
+        "demand_steps": policy.chain.row_steps,
+    }
+    metadata = {
+        "format": FORMAT_NAME,
+        "format_version": FORMAT_VERSION,
+        "package_version": policy.package_version,
+        "vehicle": {"name": policy.vehicle_name, "hash": policy.vehicle_hash, "idle_drive": policy.idle_drive},
+        "friction": policy.friction,
+        "problem": policy.problem.settings(),
+        "demand": {"sources": list(policy.sources), "clipped": policy.chain.clipped},
+        "solver": {
+            "method": "inexact policy iteration, BiCGSTAB",
+            "bound_j": policy.bound_j,
+            "converged": policy.converged,
+            "columns": list(Iteration._fields),
+            "iterations": [list(iteration) for iteration in policy.iterations],
+        },
+    }
+    return arrays, json.dumps(metadata, indent=1, sort_keys=True, allow_nan=False).encode()
+
+
+def _checksum(arrays: Mapping[str, NDArray[np.float64]], metadata: bytes) -> str:
+    digest = hashlib.sha256(metadata)
+    for name in _ARRAYS:
+        array = np.ascontiguousarray(arrays[name], dtype="<f8")
+        digest.update(f"{name}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def policy_bytes(policy: Policy) -> bytes:
+    """The file's content."""
+    arrays, metadata = _content(policy)
+    members = {name: np.ascontiguousarray(array, dtype="<f8") for name, array in arrays.items()}
+    members["metadata"] = np.frombuffer(metadata, dtype=np.uint8)
+    members["checksum"] = np.frombuffer(_checksum(arrays, metadata).encode(), dtype=np.uint8)
+    output = io.BytesIO()
+    with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for name in _MEMBERS:
+            buffer = io.BytesIO()
+            np.lib.format.write_array(buffer, members[name], version=(1, 0), allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy", _ZIP_DATE)
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.create_system = 3
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, buffer.getvalue(), compresslevel=9)
+    return output.getvalue()
+
+
+def save_policy(policy: Policy, path: Path | str) -> None:
+    """Write a policy file, atomically; the same policy gives the same bytes. `ConfigError` if it cannot be written."""
+    atomic_write(path, policy_bytes(policy))
+
+
+def load_policy(path: Path | str) -> Policy:
+    """Read a policy file and verify all of it.
+
+    Raises
+    ------
+    PolicyError
+        It is missing, no policy, damaged, or of another format version; one line says which, and what to do.
+    """
+    try:
+        data = read_bytes(path)
+    except ConfigError as error:
+        raise PolicyError(str(error)) from None
+    members = _read_members(data, path)
+    raw = members["metadata"].tobytes()
+    try:
+        metadata = json.loads(raw)
+        ours = metadata["format"] == FORMAT_NAME
+        version = metadata["format_version"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise PolicyError(f"{path}: is damaged: its metadata cannot be read") from None
+    if not ours:
+        raise PolicyError(f"{path}: is no policy file of {__package__}: its format is '{metadata['format']}'")
+    if version != FORMAT_VERSION:
+        raise PolicyError(f"{path}: {_other_version(version, metadata, path)}")
+    missing = [name for name in _MEMBERS if name not in members]
+    if missing:
+        raise PolicyError(f"{path}: is damaged: {', '.join(missing)} is missing")
+    for name in _ARRAYS:
+        if members[name].dtype != np.dtype("<f8"):
+            raise PolicyError(f"{path}: is damaged: {name} holds {members[name].dtype}, not float64")
+    arrays = {name: np.ascontiguousarray(members[name], dtype=np.float64) for name in _ARRAYS}
+    checksum = _checksum(arrays, raw)
+    if members["checksum"].tobytes() != checksum.encode():
+        raise PolicyError(f"{path}: is damaged: its content does not match its checksum")
+    return _policy_from(arrays, metadata, checksum, path)
+
+
+def _read_members(data: bytes, path: Path | str) -> dict[str, NDArray[Any]]:
+    if not data:
+        raise PolicyError(f"{path}: is empty")
+    if not data.startswith(b"PK\x03\x04"):
+        raise PolicyError(f"{path}: is no policy file")
+    members = {}
+    # Whatever is wrong with the bytes, and zip and npy fail in a dozen ways, it is one thing to the user.
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = [entry for entry in archive.infolist() if entry.filename.removesuffix(".npy") in _MEMBERS]
+            if sum(entry.file_size for entry in entries) > _MAX_BYTES:
+                raise PolicyError(f"{path}: is damaged or no policy file: it would need more than {_MAX_BYTES:.2g} bytes")
+            for entry in entries:
+                stream = io.BytesIO(archive.read(entry))
+                array = np.lib.format.read_array(stream, allow_pickle=False)
+                if stream.read(1):
+                    raise ValueError("bytes after the array")
+                members[entry.filename.removesuffix(".npy")] = array
+    except PolicyError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise PolicyError(f"{path}: is damaged or truncated: {reason}") from None
+    if "metadata" not in members:
+        raise PolicyError(f"{path}: is no policy file: it holds no metadata")
+    return members
+
+
+def _other_version(version: Any, metadata: Any, path: Path | str) -> str:
+    if isinstance(version, int) and version > FORMAT_VERSION:
+        return (
+            f"has format version {version}, newer than the {FORMAT_VERSION} this package ({__version__}) reads: "
+            "update the package"
+        )
+    friction = metadata.get("friction", "MU")
+    return (
+        f"has format version {version!r}, this package reads {FORMAT_VERSION}: solve it again with "
+        f"solve_policy --vehicle VEHICLE --cycle CYCLE --grid GRID --friction {friction} --output {path}"
+    )
+
+
+def _policy_from(
+    arrays: Mapping[str, NDArray[np.float64]], metadata: Any, checksum: str, path: Path | str
+) -> Policy:
+    """Build the policy; the checksum is right, so what is inconsistent now was written by another program."""
+    try:
+        settings = {key: value for key, value in metadata["problem"].items() if key != "name"}
+        problem = problem_from({"format": PROBLEM_FORMAT, **settings}, path)
+        problem = dataclasses.replace(problem, name=str(metadata["problem"]["name"]))
+        points = problem.power_w.size
+        for name, shape in (
+            ("front_share", problem.shape),
+            ("cost_j", problem.shape),
+            ("demand_probability", (points, points)),
+            ("demand_steps", (points,)),
+        ):
+            if arrays[name].shape != shape:
+                raise PolicyError(f"{path}: {name} has shape {arrays[name].shape}, its axes say {shape}")
+            if not np.all(np.isfinite(arrays[name])):
+                raise PolicyError(f"{path}: {name} holds a value that is not finite")
+        if np.min(arrays["front_share"]) < 0.0 or np.max(arrays["front_share"]) > 1.0:
+            raise PolicyError(f"{path}: front_share holds a value outside 0 to 1")
+        probability = arrays["demand_probability"]
+        if np.min(probability) < 0.0 or np.max(np.abs(probability.sum(axis=1) - 1.0)) > 1e-9:
+            raise PolicyError(f"{path}: a row of demand_probability is no distribution")
+        solver = metadata["solver"]
+        chain = DemandChain(problem.power_w, probability, arrays["demand_steps"], float(metadata["demand"]["clipped"]))
+        return Policy(
+            problem=problem,
+            friction=float(metadata["friction"]),
+            front_share=arrays["front_share"],
+            cost_j=arrays["cost_j"],
+            chain=chain,
+            vehicle_name=str(metadata["vehicle"]["name"]),
+            vehicle_hash=str(metadata["vehicle"]["hash"]),
+            idle_drive=str(metadata["vehicle"]["idle_drive"]),
+            sources=tuple(metadata["demand"]["sources"]),
+            iterations=tuple(Iteration(*row) for row in solver["iterations"]),
+            bound_j=float(solver["bound_j"]),
+            converged=bool(solver["converged"]),
+            package_version=str(metadata["package_version"]),
+            checksum=checksum,
+        )
+    except ConfigError as error:
+        raise PolicyError(str(error)) from None
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise PolicyError(f"{path}: its metadata is incomplete: {error!r}") from None
+
+
+def load_policy_bank(path: Path | str) -> list[Policy]:
+    """All policies of a folder (`*.npz`), or the one in a file, by rising friction.
+
+    Raises
+    ------
+    PolicyError
+        There is none, one is bad, two are for the same friction, or they are for different cars.
+    """
+    path = Path(path)
+    files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+    if not files:
+        raise PolicyError(f"{path}: holds no policy file (*.npz)")
+    by_friction: dict[float, Path] = {}
+    bank = []
+    for file in files:
+        policy = load_policy(file)
+        if policy.friction in by_friction:
+            raise PolicyError(f"{file}: is for friction {policy.friction:g}, as is {by_friction[policy.friction].name}")
+        by_friction[policy.friction] = file
+        if bank and policy.vehicle_hash != bank[0].vehicle_hash:
+            raise PolicyError(
+                f"{file}: was solved for '{policy.vehicle_name}' ({policy.vehicle_hash}), "
+                f"{files[0].name} for '{bank[0].vehicle_name}' ({bank[0].vehicle_hash}): a folder holds one car's policies"
+            )
+        bank.append(policy)
+    return sorted(bank, key=lambda policy: policy.friction)
+
+
+def choose(bank: Sequence[Policy], friction: float) -> Policy:
+    """The policy whose friction is nearest by ratio; halfway between two, the one for the more slippery road."""
+    if not bank:
+        raise PolicyError("no policy to choose from")
+    if not (math.isfinite(friction) and friction > 0.0):
+        raise PolicyError(f"friction {friction} is out of range; allowed: > 0")
+    return min(bank, key=lambda policy: (abs(math.log(friction / policy.friction)), policy.friction))
