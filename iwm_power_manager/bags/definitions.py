@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import BagError
+from .metadata import Topic
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -34,6 +35,29 @@ def definition_of(msgtype: str) -> tuple[str, str]:
     _learn(msgtype)
     text, _ = store.generate_msgdef(msgtype, ros_version=2)
     return text, store.hash_rihs01(msgtype)
+
+
+def learn_definition(topic: Topic) -> None:
+    """Make a recorded topic's type known to `typestore`, from the definition that stands in the bag if need be.
+
+    Raises
+    ------
+    BagError
+        The bag carries no definition that can be read, and none is installed.
+    """
+    store = typestore()
+    if topic.type in store.fielddefs:
+        return
+    if topic.definition:
+        from rosbags.typesys import TypesysError, get_types_from_msg
+
+        try:
+            types = get_types_from_msg(topic.definition, topic.type)
+            store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
+            return
+        except TypesysError as error:
+            raise BagError(f"{topic.name}: the definition of {topic.type} cannot be read: {error}") from None
+    _learn(topic.type)
 
 
 def _learn(msgtype: str) -> None:
