@@ -59,25 +59,26 @@ class Cycle:
         """Length of the trace: its speed, integrated."""
         return float(np.sum(np.diff(self.time_s) * (self.speed_mps[1:] + self.speed_mps[:-1])) / 2.0)
 
+    @property
+    def source(self) -> str:
+        """What errors name: the file, or the name where there is none."""
+        return self.path or self.name
+
     def resample(self, dt_s: float) -> Cycle:
         """The same trace at an even step, from its first point to the last whole step inside it.
 
         Time starts at zero. A cycle shorter than one step is refused.
         """
         if not (math.isfinite(dt_s) and dt_s > 0.0):
-            raise ConfigError(self.path or self.name, "dt_s", f"{dt_s} is out of range", "> 0 s")
+            raise ConfigError(self.source, "dt_s", f"{dt_s} is out of range", "> 0 s")
         # A duration that is a whole number of steps must not lose its last one to rounding.
         steps = math.floor(self.duration_s / dt_s + 1e-9)
         if steps < 1:
-            raise ConfigError(self.path or self.name, "time_s", f"{self.duration_s:g} s is shorter than a step", f">= {dt_s:g} s")
+            raise ConfigError(self.source, "time_s", f"{self.duration_s:g} s is shorter than a step", f">= {dt_s:g} s")
         if steps > MAX_SAMPLES:
-            raise ConfigError(
-                self.path or self.name,
-                "time_s",
-                f"{self.duration_s:g} s is too long for steps of {dt_s:g} s",
-                f"<= {MAX_SAMPLES * dt_s:g} s",
-            )
-        time = np.arange(steps + 1) * dt_s
+            problem = f"{self.duration_s:g} s is too long for steps of {dt_s:g} s"
+            raise ConfigError(self.source, "time_s", problem, f"<= {MAX_SAMPLES * dt_s:g} s")
+        time: NDArray[np.float64] = np.arange(steps + 1, dtype=np.float64) * dt_s
         at = self.time_s[0] + time
         return Cycle(
             name=self.name,
@@ -168,7 +169,8 @@ def _check_rows(path: Path | str, places: list[str], columns: dict[str, NDArray[
             low, high = _RANGES[name]
             bad = np.flatnonzero((values < low) | (values > high))
             if bad.size:
-                raise ConfigError(path, places[bad[0]], f"{name} {values[bad[0]]:g} is out of range", f"{low:g} to {high:g}")
+                problem = f"{name} {values[bad[0]]:g} is out of range"
+                raise ConfigError(path, places[bad[0]], problem, f"{low:g} to {high:g}")
     back = np.flatnonzero(np.diff(columns["time_s"]) <= 0.0)
     if back.size:
         at = int(back[0]) + 1

@@ -37,7 +37,6 @@ from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import atomic_write, read_bytes
 from iwm_power_manager.mdp.demand import DemandChain, Source
 from iwm_power_manager.mdp.policy_iteration import GATED, Iteration, Solution, expect_over_demand
-from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
 from iwm_power_manager.mdp.problem import (
     ERROR_ABSOLUTE,
     POWER_ERROR_ROAD,
@@ -47,6 +46,7 @@ from iwm_power_manager.mdp.problem import (
     ProblemParams,
     problem_from,
 )
+from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
 from iwm_power_manager.mdp.transitions import axles_gated
 from iwm_power_manager.vehicle import Vehicle
 
@@ -65,7 +65,7 @@ class PolicyTable(NamedTuple):
 
     Attributes
     ----------
-    power_w, speed_mps, slip_front, slip_rear, previous_share : axes; S has one point where the previous share is no state
+    power_w, speed_mps, slip_front, slip_rear, previous_share : axes; the last has one point if it is no state
     share : control levels, 0..1
     front_share : float64[P, V, F, R, S]
     expected_cost_j : float64[P, V, F, R, S], expected cost-to-go after a step: E[J(next demand, v, f, r, s) | P]
@@ -218,7 +218,6 @@ def make_policy(
 ) -> Policy:
     """A `Policy` from a solution. Its bound includes the rounding of the cost-to-go."""
     quantum = cost_quantum_j(problem.tolerance_j)
-    powers, shares, cells = solution.cost_j.shape
     cost = np.round(solution.cost_j / quantum) * quantum + 0.0
     bound = solution.bound_j + quantum / 2.0
     front_share = np.append(problem.share, np.nan)[solution.policy]
@@ -370,7 +369,9 @@ def _read_members(data: bytes, path: Path | str) -> dict[str, NDArray[Any]]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             entries = [entry for entry in archive.infolist() if entry.filename.removesuffix(".npy") in _MEMBERS]
             if sum(entry.file_size for entry in entries) > _MAX_BYTES:
-                raise PolicyError(f"{path}: is damaged or no policy file: it would need more than {_MAX_BYTES:.2g} bytes")
+                raise PolicyError(
+                    f"{path}: is damaged or no policy file: it would take more than {_MAX_BYTES:.2g} bytes"
+                )
             for entry in entries:
                 stream = io.BytesIO(archive.read(entry))
                 array = np.lib.format.read_array(stream, allow_pickle=False)
@@ -379,7 +380,7 @@ def _read_members(data: bytes, path: Path | str) -> dict[str, NDArray[Any]]:
                 members[entry.filename.removesuffix(".npy")] = array
     except PolicyError:
         raise
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001
         reason = " ".join(str(error).split()) or type(error).__name__
         raise PolicyError(f"{path}: is damaged or truncated: {reason}") from None
     if "metadata" not in members:
@@ -400,9 +401,7 @@ def _other_version(version: Any, metadata: Any, path: Path | str) -> str:
     )
 
 
-def _policy_from(
-    arrays: Mapping[str, NDArray[np.float64]], metadata: Any, checksum: str, path: Path | str
-) -> Policy:
+def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, checksum: str, path: Path | str) -> Policy:
     """Build the policy; the checksum is right, so what is inconsistent now was written by another program."""
     try:
         settings = {key: value for key, value in metadata["problem"].items() if key != "name"}
@@ -461,7 +460,7 @@ def load_policy_bank(path: Path | str) -> list[Policy]:
     if not files:
         raise PolicyError(f"{path}: holds no policy file (*.npz)")
     by_friction: dict[float, Path] = {}
-    bank = []
+    bank: list[Policy] = []
     for file in files:
         policy = load_policy(file)
         if policy.friction in by_friction:
@@ -469,8 +468,8 @@ def load_policy_bank(path: Path | str) -> list[Policy]:
         by_friction[policy.friction] = file
         if bank and policy.vehicle_hash != bank[0].vehicle_hash:
             raise PolicyError(
-                f"{file}: was solved for '{policy.vehicle_name}' ({policy.vehicle_hash}), "
-                f"{files[0].name} for '{bank[0].vehicle_name}' ({bank[0].vehicle_hash}): a folder holds one car's policies"
+                f"{file}: was solved for '{policy.vehicle_name}' ({policy.vehicle_hash}), {files[0].name} for "
+                f"'{bank[0].vehicle_name}' ({bank[0].vehicle_hash}): a folder holds one car's policies"
             )
         bank.append(policy)
     return sorted(bank, key=lambda policy: policy.friction)

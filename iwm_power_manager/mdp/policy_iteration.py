@@ -134,14 +134,11 @@ class Solution:
     iterations: tuple[Iteration, ...]
 
 
-def split_cells(gated: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
-    """Start and cell lists of the free and of the gated states (see `Model`) from gated[P, C]."""
-    lists = []
-    for mask in (~gated, gated):
-        start = np.zeros(mask.shape[0] + 1, dtype=np.int64)
-        start[1:] = np.cumsum(mask.sum(axis=1))
-        lists += [start, np.nonzero(mask)[1].astype(np.int32)]
-    return tuple(lists)  # type: ignore[return-value]
+def list_cells(mask: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Start and cell list (see `Model`) of the states chosen by mask[P, C]."""
+    start = np.zeros(mask.shape[0] + 1, dtype=np.int64)
+    start[1:] = np.cumsum(mask.sum(axis=1))
+    return start, np.nonzero(mask)[1].astype(np.int32)
 
 
 @kernel
@@ -165,7 +162,7 @@ def _interpolate(w, corner, step_v, step_f, step_r, a, b, c):
 
 @parallel_kernel
 def expect_over_demand(demand, cost, first_column, last_column, out):
-    """out[p] = sum over q of demand[p, q] * cost[q] in a range of columns; arrays [P, n], summed in the order of q."""
+    """Compute out = demand @ cost in a range of columns; arrays [P, n]. Each sum runs in the order of the rows."""
     for first in range(first_column, last_column, _BLOCK):
         last = min(first + _BLOCK, last_column)
         for p in range(demand.shape[0]):
@@ -236,7 +233,7 @@ def improve(model, w, first_power, last_power, out, policy):
 
 @parallel_kernel
 def apply_policy(model, w, policy, cost_factor, first_power, last_power, out):
-    """out = cost_factor * c_pi + gamma * P_pi J for a range of power demands, from w = demand @ J."""
+    """Compute out = cost_factor * c_pi + gamma * P_pi J for a range of power demands, from w = demand @ J."""
     n_u = model.switching_j.shape[1]
     n_s = model.switching_j.shape[0]
     tracked = n_s > 1
@@ -312,16 +309,12 @@ class _Operator:
     def _expect(self, cost: NDArray[np.float64]) -> None:
         rows = cost.shape[0]
         flat, ahead = cost.reshape(rows, -1), self.ahead.reshape(rows, -1)
-        over_ranges(
-            flat.shape[1], lambda first, last: expect_over_demand(self.model.demand, flat, first, last, ahead)
-        )
+        over_ranges(flat.shape[1], lambda first, last: expect_over_demand(self.model.demand, flat, first, last, ahead))
         self.sweeps += 1
 
     def improve(self, cost: NDArray[np.float64], out: NDArray[np.float64], policy: NDArray[np.int16]) -> None:
         self._expect(cost)
-        over_ranges(
-            cost.shape[0], lambda first, last: improve(self.model, self.ahead, first, last, out, policy)
-        )
+        over_ranges(cost.shape[0], lambda first, last: improve(self.model, self.ahead, first, last, out, policy))
 
     def evaluate(
         self, cost: NDArray[np.float64], policy: NDArray[np.int16], cost_factor: float, out: NDArray[np.float64]

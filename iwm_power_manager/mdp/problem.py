@@ -204,9 +204,17 @@ def problem_from(content: Any, path: Path | str) -> Problem:
     check_keys(path, content, _REQUIRED, _OPTIONAL)
     check_integer(path, "format", content["format"], FORMAT, FORMAT)
     axes = {key: read_axis(path, key, content[key], *limits) for key, limits in _AXES.items()}
+    switching = {
+        key: check_number(path, key, content.get(key, 0.0), 0.0, 1e6, unit="J")
+        for key in ("switching_cost_j", "switching_fixed_cost_j")
+    }
     problem = Problem(
         name=Path(path).stem,
-        **axes,
+        power_w=axes["power_w"],
+        speed_mps=axes["speed_mps"],
+        slip_front=axes["slip_front"],
+        slip_rear=axes["slip_rear"],
+        share=axes["share"],
         previous_share=check_bool(path, "previous_share", content.get("previous_share", False)),
         dt_s=check_number(path, "dt_s", content["dt_s"], 0.001, 10.0, unit="s"),
         discount=check_number(path, "discount", content["discount"], 0.0, 0.9999),
@@ -216,10 +224,8 @@ def problem_from(content: Any, path: Path | str) -> Problem:
         slip_model=check_choice(path, "slip_model", content.get("slip_model", "dynamic"), SLIP_MODELS),
         skid_avoidance=check_choice(path, "skid_avoidance", content.get("skid_avoidance", "braking"), SKID_AVOIDANCE),
         critical_slip=check_number(path, "critical_slip", content.get("critical_slip", 0.2), 0.01, 1.0),
-        switching_cost_j=check_number(path, "switching_cost_j", content.get("switching_cost_j", 0.0), 0.0, 1e6, unit="J"),
-        switching_fixed_cost_j=check_number(
-            path, "switching_fixed_cost_j", content.get("switching_fixed_cost_j", 0.0), 0.0, 1e6, unit="J"
-        ),
+        switching_cost_j=switching["switching_cost_j"],
+        switching_fixed_cost_j=switching["switching_fixed_cost_j"],
         tolerance_j=check_number(path, "tolerance_j", content.get("tolerance_j", 0.01), 1e-6, 1e6, unit="J"),
         max_iterations=check_integer(path, "max_iterations", content.get("max_iterations", 100), 1, 10_000),
     )
@@ -239,7 +245,8 @@ def _check_combination(problem: Problem, path: Path | str) -> None:
                 raise ConfigError(path, key, "needs previous_share: true", "0, or previous_share: true")
     pairs = int(np.prod([float(n) for n in problem.shape[:4]])) * problem.share.size
     if pairs > MAX_PAIRS:
-        raise ConfigError(path, "", f"has {pairs:.3g} pairs of state and control", f"<= {MAX_PAIRS:.3g}: use coarser axes")
+        problem_text = f"has {pairs:.3g} pairs of state and control"
+        raise ConfigError(path, "", problem_text, f"<= {MAX_PAIRS:.3g}: use coarser axes")
 
 
 def read_axis(file: Path | str, key: str, value: Any, low: float, high: float, unit: str) -> NDArray[np.float64]:
@@ -263,7 +270,8 @@ def read_axis(file: Path | str, key: str, value: Any, low: float, high: float, u
         if abs(first + intervals * step - last) > 1e-6 * step:
             raise ConfigError(file, dotted(key, "step"), f"{step:g} does not divide {first:g} to {last:g}")
         if intervals >= MAX_AXIS_POINTS:
-            raise ConfigError(file, dotted(key, "step"), f"{step:g} gives {intervals + 1} points", f"<= {MAX_AXIS_POINTS}")
+            problem = f"{step:g} gives {intervals + 1} points"
+            raise ConfigError(file, dotted(key, "step"), problem, f"<= {MAX_AXIS_POINTS}")
         # Whole multiples, rounded: 0.1 * 3 must be the 0.3 that a list would hold.
         points = np.array([float(f"{first + i * step:.12g}") for i in range(intervals + 1)])
     else:
@@ -275,7 +283,8 @@ def read_axis(file: Path | str, key: str, value: Any, low: float, high: float, u
 
 def _points(file: Path | str, key: str, value: Any, low: float, high: float, unit: str) -> NDArray[np.float64]:
     if not isinstance(value, list) or not value:
-        raise ConfigError(file, key, f"{value!r} is no axis", "[a, b, ...], {from, to, step} or {mirrored: [0, a, ...]}")
+        allowed = "[a, b, ...], {from, to, step} or {mirrored: [0, a, ...]}"
+        raise ConfigError(file, key, f"{value!r} is no axis", allowed)
     points = np.array([check_number(file, f"{key}[{i}]", x, low, high, unit=unit) for i, x in enumerate(value)])
     for i in np.flatnonzero(np.diff(points) <= 0.0):
         raise ConfigError(file, f"{key}[{i + 1}]", f"{value[i + 1]} does not increase", f"> {value[i]}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 
 import numba
 
@@ -26,10 +27,10 @@ def over_ranges(size: int, function: Callable[[int, int], None]) -> None:
     """
     threads = numba.config.NUMBA_NUM_THREADS
     count = min(size, threads * _RANGES_PER_THREAD) if threads > 1 else 1
-    edges = [size * i // count for i in range(count + 1)] if count else [0]
     if count <= 1:
         function(0, size)
         return
-    futures = [_pool().submit(function, low, high) for low, high in zip(edges, edges[1:], strict=False)]
+    edges = [size * i // count for i in range(count + 1)]
+    futures = [_pool().submit(function, low, high) for low, high in pairwise(edges)]
     for future in futures:
         future.result()

@@ -17,7 +17,7 @@ from iwm_power_manager.actuation.limits import battery_scale, car_power_w
 from iwm_power_manager.actuation.torque import blend, conversion_speed_radps
 from iwm_power_manager.grid import locate
 from iwm_power_manager.jit import kernel, parallel_kernel
-from iwm_power_manager.mdp.policy_iteration import Model, split_cells
+from iwm_power_manager.mdp.policy_iteration import Model, list_cells
 from iwm_power_manager.mdp.problem import (
     ERROR_LAGRANGE,
     ERROR_SQUARED,
@@ -86,7 +86,7 @@ def wheel_speed_of_state(slip: float, speed_mps: float, vehicle: VehicleParams) 
 
 @kernel
 def error_cost_j(power_demand_w: float, delivered_w: float, problem: ProblemParams) -> float:
-    """Price of the difference between the demand and what was delivered during a step, J (the term alpha * M of eq. 28)."""
+    """Price of the difference between demand and delivered power during a step, J (alpha * M in eq. 28)."""
     error = power_demand_w - delivered_w
     if problem.error_norm == ERROR_SQUARED:
         rate = error * error / 1000.0
@@ -171,12 +171,14 @@ def _dynamic_step(
 
     drag_front = idle_drag_nm(front_motor, front_speed, motor)
     drag_rear = idle_drag_nm(rear_motor, rear_speed, motor)
+    resisting_front = drag_front - front_friction
+    resisting_rear = drag_rear - rear_friction
     motion = step(
         speed_mps,
         (front_speed, front_speed, rear_speed, rear_speed),
         0.0,
         (front_motor, front_motor, rear_motor, rear_motor),
-        (drag_front - front_friction, drag_front - front_friction, drag_rear - rear_friction, drag_rear - rear_friction),
+        (resisting_front, resisting_front, resisting_rear, resisting_rear),
         0.0,
         (problem.friction, problem.friction, problem.friction, problem.friction),
         dt,
@@ -329,9 +331,7 @@ def gated_states(problem: Problem, friction: float) -> NDArray[np.bool_]:
     return gated
 
 
-def build_model(
-    problem: Problem, vehicle: VehicleParams, friction: float, demand: NDArray[np.float64]
-) -> Model:
+def build_model(problem: Problem, vehicle: VehicleParams, friction: float, demand: NDArray[np.float64]) -> Model:
     """Tabulate cost and next state of every state and control.
 
     Parameters
@@ -343,7 +343,9 @@ def build_model(
     """
     params = problem.params(friction)
     axes = (problem.power_w, problem.speed_mps, problem.slip_front, problem.slip_rear)
-    free_start, free_cell, gated_start, gated_cell = split_cells(gated_states(problem, friction))
+    no_choice = gated_states(problem, friction)
+    free_start, free_cell = list_cells(~no_choice)
+    gated_start, gated_cell = list_cells(no_choice)
 
     def empty(n: int) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]]:
         return np.empty(n), np.empty(n, np.int32), np.empty((n, 3))
