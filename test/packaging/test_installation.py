@@ -28,7 +28,7 @@ def run(*command: str | Path, cwd: Path, **environment: str) -> subprocess.Compl
         env={**os.environ, "PATH": path, **environment},
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=120,
         check=False,
         stdin=subprocess.DEVNULL,
     )
