@@ -248,7 +248,7 @@ def load_run(path: Path | str) -> Run:
                 raise ConfigError(path, "columns", "are those of another version", ", ".join(COLUMNS))
             leaves = iter(content["final"].tolist())
             return Run(float(content["dt_s"]), content["series"], _rebuild(plant.PlantState, leaves))
-    except (zipfile.BadZipFile, KeyError, ValueError, StopIteration):
+    except (zipfile.BadZipFile, EOFError, KeyError, TypeError, ValueError, StopIteration):
         raise ConfigError(path, "", "is no recorded run") from None
 
 
