@@ -38,6 +38,8 @@ SPECS = (
     Spec("policy_file", "policies", "Policy file, or folder with a bank of policies over friction; '' for none."),
     Spec("strategy", "sdp", "Strategy that splits the demand between the axles.", choices=_NAMED_STRATEGIES,
          change=Change.ALWAYS),
+    Spec("rule", [0.0, 0.5, 0.0, 0.5], "Coefficients a, b, c, d of strategy rule: P_front = a + b * P_demand driving, "
+         "c + d * P_demand braking; W, 1.", -1e5, 1e5, length=4),
     Spec("fallback", "none", "What to do when the policy is missing, unreadable or made for another car: none refuses "
          "to configure, equal runs equal split.", choices=("none", "equal")),
     Spec("autostart", True, "Configure and activate at start, without a lifecycle manager.", change=Change.NEVER),

@@ -23,7 +23,7 @@ from rclpy.parameter import Parameter
 
 from iwm_power_manager.errors import IwmError
 
-Value = bool | int | float | str | list[str] | list[int]
+Value = bool | int | float | str | list[str] | list[float]
 
 
 class Change(enum.Enum):
@@ -48,7 +48,7 @@ class Spec(NamedTuple):
     description : one sentence, with the unit where there is one
     low, high : range of a number; of a list of numbers, of each element
     choices : allowed texts
-    length : exact length of a list
+    length : exact length of a list, whose texts have to differ; 0 for any length
     change : when it may change
     """
 
@@ -61,32 +61,38 @@ class Spec(NamedTuple):
     length: int = 0
     change: Change = Change.UNCONFIGURED
 
+    @property
+    def holds_texts(self) -> bool:
+        """The parameter is a list of texts."""
+        return isinstance(self.default, list) and isinstance(self.default[0], str)
+
     def allowed(self) -> str:
         """What the value may be, for messages and documentation."""
         if self.choices:
             return " | ".join(self.choices)
-        if self.length:
-            return f"{self.length} different names"
         if isinstance(self.default, bool):
             return "true | false"
-        if isinstance(self.default, int | float):
-            return f"{self.low:g} to {self.high:g}"
-        if isinstance(self.default, str):
-            return "text"
-        return "a list of texts" if isinstance(self.default[0], str) else "a list of whole numbers"
+        if self.holds_texts:
+            return f"{self.length} different names" if self.length else "a list of texts"
+        if isinstance(self.default, list):
+            return f"{self.length or 'any number of'} numbers from {self.low:g} to {self.high:g}"
+        return "text" if isinstance(self.default, str) else f"{self.low:g} to {self.high:g}"
 
     def problem(self, value: Any) -> str:
         """What is wrong with a value of the right type; "" if nothing is."""
-        wrong = False
+        # Ranges are written so that NaN, which rclpy's own range check lets through, is refused.
         if self.choices:
             wrong = value not in self.choices
-        elif self.length:
-            wrong = len(value) != self.length or len(set(value)) != self.length or not all(value)
-        elif isinstance(self.default, list):
-            wrong = not all(self.low <= item <= self.high for item in value if not isinstance(item, str))
-        elif isinstance(self.default, int | float) and not isinstance(self.default, bool):
-            # Written so that NaN, which rclpy's own range check lets through, is refused.
+        elif isinstance(self.default, bool | str):
+            wrong = False
+        elif not isinstance(self.default, list):
             wrong = not self.low <= value <= self.high
+        elif self.length and len(value) != self.length:
+            wrong = True
+        elif self.holds_texts:
+            wrong = self.length > 0 and not (all(value) and len(set(value)) == self.length)
+        else:
+            wrong = not all(self.low <= item <= self.high for item in value)
         return f"{self.name}: {value!r} is not allowed; allowed: {self.allowed()}" if wrong else ""
 
     def descriptor(self) -> ParameterDescriptor:
@@ -117,7 +123,7 @@ def declare(node: Node, specs: Iterable[Spec]) -> dict[str, Any]:
         try:
             value = node.declare_parameter(spec.name, spec.default, spec.descriptor()).value
         except (InvalidParameterTypeException, InvalidParameterValueException, ParameterUninitializedException):
-            given = node._parameter_overrides.get(spec.name)  # noqa: SLF001 - the exceptions do not carry the value
+            given = node._parameter_overrides.get(spec.name)  # the exceptions do not all carry the value
             raise ParameterError(
                 f"parameter {spec.name}: {given.value if given else None!r} is not allowed; "
                 f"allowed: {spec.allowed()} ({_type_name(spec)})"

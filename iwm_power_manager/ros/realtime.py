@@ -41,6 +41,11 @@ def stop_automatic_collection() -> None:
     gc.disable()
 
 
+def collect() -> None:
+    """Collect what has become garbage since `stop_automatic_collection`."""
+    gc.collect()
+
+
 def resume_automatic_collection() -> None:
     """Undo `stop_automatic_collection`."""
     gc.enable()

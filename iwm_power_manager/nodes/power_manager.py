@@ -1,0 +1,483 @@
+"""Node `power_manager`: between the driver's demand and four motors.
+
+A managed node. Configure loads and verifies vehicle and policy and warms the compiled law; activate starts commanding;
+deactivate commands zero torque first. Everything it decides, it decides in `control.controller`; here are DDS, the
+clock, the lifecycle and nothing else. See docs/interface.md for topics and parameters, docs/safety.md for the reasons.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import Float64
+
+from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
+from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.errors import IwmError
+from iwm_power_manager.nodes import power_manager_config as config
+from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
+from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport
+from iwm_power_manager.ros import diagnostics, messages, qos, realtime
+from iwm_power_manager.ros.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
+from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
+from iwm_power_manager.share import resolve
+from iwm_power_manager.vehicle import load_vehicle
+
+_COMMANDS = (messages.WHEEL_TORQUE_COMMAND, messages.FRICTION_BRAKE_COMMAND)
+_ZERO = (0.0, 0.0, 0.0, 0.0)
+_NS_PER_S = 1_000_000_000
+#: The watchdog also wakes the executor often enough for signals to be noticed.
+_WATCHDOG_PERIOD_S = 0.1
+_REPORT_PERIOD_S = 1.0
+#: Diagnostics on change come no faster than this: a gate may open and close at the control rate.
+_CHANGE_PERIOD_S = 0.1
+_ACKNOWLEDGE_S = 0.2
+
+
+class PowerManager(LifecycleNode):
+    """The managed node.
+
+    Raises
+    ------
+    ParameterError
+        A parameter given at start is wrong.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("power_manager")
+        self._values: dict[str, Any] = declare(self, config.SPECS)
+        problem = config.check_together(self._values)
+        try:
+            self._processors = realtime.parse_affinity(self._values["cpu_affinity"])
+        except ValueError as error:
+            problem = f"cpu_affinity: {error}"
+        if problem:
+            raise ParameterError(f"parameter {problem}")
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._apply_parameters)
+        self._lockstep: bool = self._values["lockstep"]
+        self._queue = LockstepQueue()
+        self._controller: Controller | None = None
+        self._policies: Policies | None = None
+        self._subscriptions_made: list[Any] = []
+        self._publishers_made: dict[str, Any] = {}
+        self._step_timer: Any = None
+        self._active = False
+        self._fault = ""
+        self._wheel_names: tuple[str, ...] = tuple(self._values["wheel_names"])
+        self._period_s = 1.0 / self._values["rate_hz"]
+        self._last_step_ns: int | None = None
+        self._last_step_steady_s = 0.0
+        self._answer: tuple[JointState, JointState, JointState] | None = None
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._report = PowerManagerReport(self.get_name(), self._wheel_names, None)
+        self._report_due = False
+        self._changes = ChangeDetector(_CHANGE_PERIOD_S)
+        self.create_timer(_REPORT_PERIOD_S, self._on_report_timer)
+        self.create_timer(_WATCHDOG_PERIOD_S, self._watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    # Lifecycle
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load and verify vehicle and policy, warm the law, then appear on the topics."""
+        self._values = {name: self.get_parameter(name).value for name in config.BY_NAME}
+        self._fault = ""
+        try:
+            self._build()
+        except IwmError as error:
+            self._fault = str(error)
+            self.get_logger().error(self._fault)
+            self._release()
+            return TransitionCallbackReturn.FAILURE
+        self._create_entities()
+        refused = realtime.request(self._values["realtime_priority"], self._processors, self._values["lock_memory"])
+        for what in refused:
+            self.get_logger().warning(f"the system refused {what}")
+        if self._values["gc_off_path"]:
+            realtime.stop_automatic_collection()
+        return super().on_configure(state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Start commanding, from the law's initial state."""
+        self._fault = ""
+        self._queue.clear()
+        self._start_over()
+        result = super().on_activate(state)
+        self._active = True
+        self._last_step_steady_s = time.monotonic()
+        if not self._lockstep:
+            self._step_timer = self.create_timer(self._period_s, self._on_step_timer)
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Command zero torque, then stop commanding."""
+        self._stop_commanding()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Let go of vehicle, policy, publishers and subscriptions."""
+        result = super().on_cleanup(state)
+        self._release()
+        return result
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Command zero torque if active, then let go of everything."""
+        self._stop_commanding()
+        result = super().on_shutdown(state)
+        self._release()
+        return result
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Command zero torque and go back to unconfigured: a transition raised what nobody expected."""
+        self._stop_commanding()
+        self._release()
+        self.get_logger().error("a transition failed; the node is unconfigured again")
+        return TransitionCallbackReturn.SUCCESS
+
+    def start(self) -> bool:
+        """Configure and activate; False if that was refused."""
+        return (
+            self.trigger_configure() == TransitionCallbackReturn.SUCCESS
+            and self.trigger_activate() == TransitionCallbackReturn.SUCCESS
+        )
+
+    def stop(self) -> None:
+        """Deactivate, if active."""
+        if self._active:
+            self.trigger_deactivate()
+
+    def _build(self) -> None:
+        values = self._values
+        vehicle = load_vehicle(resolve(values["vehicle_file"]), values["idle_drive"] or None)
+        policies = choose_policies(
+            values["policy_file"], values["strategy"], values["fallback"], values["rule"], vehicle
+        )
+        if policies.fallback_reason:
+            self.get_logger().warning(f"runs equal split instead of {values['strategy']}: {policies.fallback_reason}")
+        limits = ControllerLimits(
+            config.input_limits(values, vehicle.params.wheel.radius_m),
+            None if self._lockstep else config.age_limits_s(values),
+            config.supervision_limits(values),
+        )
+        self._wheel_names = tuple(values["wheel_names"])
+        self._period_s = 1.0 / values["rate_hz"]
+        self._controller = Controller(
+            vehicle.params,
+            self._wheel_names,
+            limits,
+            config.law_settings(values, policies.strategy),
+            policies.table(values["friction"]),
+            values["friction"],
+        )
+        self._policies = policies
+        # The first call compiles the law or reads it from the cache: seconds that no control step may take.
+        for table in policies.tables():
+            self._controller.policy = table
+            self._controller.step(0, self._period_s)
+        self._controller.policy = policies.table(values["friction"])
+        self._controller.reset()
+        self._report = PowerManagerReport(
+            self.get_name(), self._wheel_names, None if self._lockstep else values["rate_hz"]
+        )
+
+    def _create_entities(self) -> None:
+        profile = qos.profile(lockstep=self._lockstep)
+        overrides = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
+        self._publishers_made = {
+            topic: self.create_lifecycle_publisher(JointState, topic, profile, **overrides)
+            for topic in (*_COMMANDS, messages.POWER_MANAGER_STATE)
+        }
+        inputs = (
+            (TwistStamped, messages.VEHICLE_SPEED, self._on_speed),
+            (JointState, messages.WHEEL_STATES, self._on_wheels),
+            (BatteryState, messages.BATTERY_STATE, self._on_battery),
+            (Float64, messages.POWER_DEMAND, self._on_demand),
+            (Float64, messages.ROAD_FRICTION, self._on_friction),
+        )
+        self._subscriptions_made = [
+            self.create_subscription(kind, topic, callback, profile, **overrides) for kind, topic, callback in inputs
+        ]
+
+    def _release(self) -> None:
+        for subscription in self._subscriptions_made:
+            self.destroy_subscription(subscription)
+        for publisher in self._publishers_made.values():
+            self.destroy_lifecycle_publisher(publisher)
+        self._subscriptions_made = []
+        self._publishers_made = {}
+        self._controller = None
+        self._policies = None
+        if self._values["gc_off_path"]:
+            realtime.resume_automatic_collection()
+
+    def _stop_commanding(self) -> None:
+        if not self._active:
+            return
+        self._active = False
+        if self._step_timer is not None:
+            self.destroy_timer(self._step_timer)
+            self._step_timer = None
+        self._command_zero()
+        for topic in _COMMANDS:
+            self._publishers_made[topic].wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
+
+    def _start_over(self) -> None:
+        assert self._controller is not None
+        self._controller.reset()
+        self._last_step_ns = None
+        self._answer = None
+
+    # Inputs: at once into the monitor, or, in lock-step, into the queue until a set is complete
+
+    def _on_speed(self, message: TwistStamped, info: dict[str, Any]) -> None:
+        reading = messages.read_vehicle_speed(message)
+        if self._lockstep:
+            self._push(SPEED, reading, info)
+        elif self._active and self._controller:
+            self._controller.monitor.take_speed(reading, self._now_ns())
+
+    def _on_wheels(self, message: JointState, info: dict[str, Any]) -> None:
+        reading = messages.read_wheel_speeds(message)
+        if self._lockstep:
+            self._push(WHEELS, reading, info)
+        elif self._active and self._controller:
+            self._controller.monitor.take_wheels(reading, self._now_ns())
+
+    def _on_battery(self, message: BatteryState, info: dict[str, Any]) -> None:
+        reading = messages.read_battery_state(message)
+        if self._lockstep:
+            self._push(BATTERY, reading, info)
+        elif self._active and self._controller:
+            self._controller.monitor.take_battery(reading, self._now_ns())
+
+    def _on_demand(self, message: Float64, info: dict[str, Any]) -> None:
+        demand_w = messages.read_number(message)
+        if self._lockstep:
+            self._queue.push_demand(info["source_timestamp"], demand_w)
+            self._step_complete_sets()
+        elif self._active and self._controller:
+            # No stamp of its own: how long DDS took to bring it is all there is to tell a late one by.
+            delay_s = (time.time_ns() - info["source_timestamp"]) / _NS_PER_S
+            self._controller.monitor.take_demand(demand_w, delay_s, self._now_ns())
+
+    def _on_friction(self, message: Float64) -> None:
+        if self._active and self._controller:
+            self._controller.monitor.take_friction(messages.read_number(message), self._now_ns())
+
+    def _push(self, topic: int, reading: Any, info: dict[str, Any]) -> None:
+        self._queue.push(topic, reading.stamp_ns, info["source_timestamp"], reading)
+        self._step_complete_sets()
+
+    # Steps
+
+    def _on_step_timer(self) -> None:
+        assert self._controller is not None
+        now_ns = self._now_ns()
+        since_s = None if self._last_step_ns is None else (now_ns - self._last_step_ns) / _NS_PER_S
+        if since_s is not None and since_s <= 0.0:
+            # The clock jumped back: the stamps and ages of before mean nothing now.
+            self._controller.monitor.forget()
+            since_s = None
+        dt_s = self._period_s if since_s is None else min(max(since_s, 0.2 * self._period_s), 3.0 * self._period_s)
+        self._take_step(now_ns, dt_s, since_s)
+        if self._report_due:
+            # Right after a step there is the most time until the next.
+            self._publish_report()
+
+    def _step_complete_sets(self) -> None:
+        if not self._active or self._controller is None:
+            return
+        while (inputs := self._queue.pop()) is not None:
+            if inputs.demand is None:
+                if self._answer is not None:
+                    self._publish(self._answer)
+                continue
+            if self._last_step_ns is not None and inputs.stamp_ns < self._last_step_ns:
+                self._start_over()
+            since_s = None if self._last_step_ns is None else (inputs.stamp_ns - self._last_step_ns) / _NS_PER_S
+            monitor = self._controller.monitor
+            monitor.take_speed(inputs.speed, inputs.stamp_ns)
+            monitor.take_wheels(inputs.wheels, inputs.stamp_ns)
+            monitor.take_battery(inputs.battery, inputs.stamp_ns)
+            monitor.take_demand(inputs.demand, 0.0, inputs.stamp_ns)
+            self._take_step(inputs.stamp_ns, self._period_s if since_s is None else since_s, since_s)
+
+    def _take_step(self, stamp_ns: int, dt_s: float, since_s: float | None) -> None:
+        assert self._controller is not None
+        started_s = time.perf_counter()
+        self._last_step_ns = stamp_ns
+        self._last_step_steady_s = time.monotonic()
+        try:
+            command, numbers = self._controller.step(stamp_ns, dt_s)
+        except ControlFaultError as error:
+            self._fault = str(error)
+            self.get_logger().fatal(f"zero torque and inactive: {error}")
+            self.trigger_deactivate()
+            return
+        self._answer = (
+            messages.torque_command_message(stamp_ns, self._wheel_names, command.motor_torque_nm),
+            messages.torque_command_message(stamp_ns, self._wheel_names, command.friction_torque_nm),
+            messages.named_numbers_message(stamp_ns, SIGNAL_NAMES, numbers),
+        )
+        self._publish(self._answer)
+        self._report.note_step(command, since_s, time.perf_counter() - started_s)
+
+    def _publish(self, answer: tuple[JointState, JointState, JointState]) -> None:
+        for publisher, message in zip(self._publishers_made.values(), answer, strict=True):
+            publisher.publish(message)
+
+    def _command_zero(self) -> None:
+        message = messages.torque_command_message(self._now_ns(), self._wheel_names, _ZERO)
+        for topic in _COMMANDS:
+            self._publishers_made[topic].publish(message)
+
+    # Parameters
+
+    def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        def together(new: dict[str, Any]) -> str:
+            problem = config.check_together(self._values | new)
+            if not problem and self._policies and "strategy" in new:
+                problem = self._policies.problem_with(new["strategy"])
+            return problem
+
+        return check_change(config.BY_NAME, parameters, configured=self._controller is not None, together=together)
+
+    def _apply_parameters(self, parameters: list[Parameter]) -> None:
+        """Hand changed values to the controller; torque follows within the law's own rate limits."""
+        new = {parameter.name: parameter.value for parameter in parameters if parameter.name in config.BY_NAME}
+        self._values |= new
+        if new and self._controller and self._policies:
+            if "strategy" in new:
+                self._policies.strategy = new["strategy"]
+            self._controller.settings = config.law_settings(self._values, self._policies.strategy)
+            self._choose_friction()
+
+    def _choose_friction(self) -> None:
+        assert self._controller is not None
+        assert self._policies is not None
+        friction: float = self._values["friction"]
+        monitor = self._controller.monitor
+        if self._values["friction_source"] == messages.ROAD_FRICTION:
+            age_s = monitor.tallies[messages.ROAD_FRICTION].age_s(self._now_ns())
+            if age_s <= self._values["friction_timeout_s"]:
+                friction = monitor.friction
+        if friction != self._controller.friction:
+            self._controller.policy = self._policies.table(friction)
+            self._controller.friction = friction
+
+    # Off the control path
+
+    def _now_ns(self) -> int:
+        return int(self.get_clock().now().nanoseconds)
+
+    def _lifecycle_state(self) -> str:
+        return str(self._state_machine.current_state[1])
+
+    def _watch(self) -> None:
+        """Ten times a second of real time: friction, a clock that stands still, reports on change.
+
+        It also wakes the executor often enough for a signal to be noticed.
+        """
+        controller = self._controller
+        if self._active and controller:
+            self._choose_friction()
+            standing_s = time.monotonic() - self._last_step_steady_s
+            if not self._lockstep and standing_s > self._values["clock_stopped_s"]:
+                self._fault = "the clock stands still"
+                self._start_over()
+                self._command_zero()
+            elif self._fault and self._last_step_ns is not None:
+                self._fault = ""
+        shown = controller and (controller.supervision.mode, controller.supervision.stale, controller.wheels_lost)
+        gate = controller and controller.command and controller.command.gate
+        if self._changes.changed((self._active, self._fault, shown, gate), time.monotonic()):
+            self._publish_report()
+
+    def _on_report_timer(self) -> None:
+        if self._active and not self._lockstep:
+            self._report_due = True
+        else:
+            self._publish_report()
+
+    def _publish_report(self) -> None:
+        self._report_due = False
+        now_ns = self._now_ns()
+        message = self._report.message(
+            now_ns, self._lifecycle_state(), self._controller, self._values, self._own_statuses()
+        )
+        self._diagnostics.publish(message)
+        if self._controller and self._values["gc_off_path"]:
+            realtime.collect()
+
+    def _own_statuses(self) -> list[diagnostics.Status]:
+        statuses = []
+        if self._fault:
+            statuses.append(diagnostics.Status("fault", diagnostics.ERROR, self._fault, {}))
+        if self._policies:
+            statuses.append(self._policies.status())
+        if self._active:
+            counts = {topic: self.count_publishers(topic) for topic in _COMMANDS}
+            others = [f"{topic} has {count} publishers" for topic, count in counts.items() if count > 1]
+            level = diagnostics.ERROR if others else diagnostics.OK
+            statuses.append(
+                diagnostics.Status(
+                    "command topics",
+                    level,
+                    "; ".join(others) or "ok",
+                    {f"{topic}: publishers": str(count) for topic, count in counts.items()},
+                )
+            )
+        return statuses
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM; exit code 1 and one line if it cannot start."""
+    stopped = False
+
+    def on_signal(_signum: int, _frame: object) -> None:
+        nonlocal stopped
+        stopped = True
+
+    # rclpy's own handlers would shut the context down before zero torque could be commanded.
+    signal.signal(signal.SIGINT, on_signal)
+    signal.signal(signal.SIGTERM, on_signal)
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        print(f"power_manager: {str(error).splitlines()[0]}", file=sys.stderr)
+        return 1
+    try:
+        node = PowerManager()
+    except IwmError as error:
+        print(f"power_manager: {error}", file=sys.stderr)
+        rclpy.shutdown()
+        return 1
+    started = not node.get_parameter("autostart").value or node.start()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while started and not stopped:
+        executor.spin_once()
+    node.stop()
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.shutdown()
+    return 0 if started else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,95 @@
+"""What the power manager reports on `/diagnostics`: collects between two reports, writes one on request."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+
+from iwm_power_manager.control.controller import Controller
+from iwm_power_manager.control.supervision import Supervision
+from iwm_power_manager.control.types import GATE_NONE, LIMIT_NAMES, Command
+from iwm_power_manager.ros import diagnostics
+
+
+class PowerManagerReport:
+    """Counts steps, gates and limits; turns them and the node's present state into diagnostics."""
+
+    def __init__(self, node_name: str, wheel_names: Sequence[str], rate_hz: float | None) -> None:
+        self._node_name = node_name
+        self._wheel_names = wheel_names
+        self._rate_hz = rate_hz
+        self._loop = diagnostics.LoopStatistics()
+        self._inputs = diagnostics.InputReport()
+        self._activity: Counter[str] = Counter()
+
+    def note_step(self, command: Command, period_s: float | None, execution_s: float) -> None:
+        """Count one step of the active node."""
+        self._loop.add(period_s, execution_s)
+        if command.gate != GATE_NONE:
+            self._activity["gate"] += 1
+        if command.limits:
+            self._activity.update(name for bit, name in LIMIT_NAMES.items() if command.limits & bit)
+
+    def message(
+        self,
+        now_ns: int,
+        lifecycle: str,
+        controller: Controller | None,
+        values: Mapping[str, Any],
+        extra: Sequence[diagnostics.Status],
+    ) -> DiagnosticArray:
+        """State of the node since the last call.
+
+        Parameters
+        ----------
+        now_ns : the node's clock
+        lifecycle : label of the lifecycle state
+        controller : None while the node is not configured
+        values : the node's parameters
+        extra : statuses of the node's own, as of the policy
+        """
+        statuses: list[diagnostics.Status] = []
+        command = controller.command if controller else None
+        statuses.append(
+            diagnostics.control_status(
+                lifecycle,
+                controller.supervision if controller else Supervision(),
+                command.gate if command else GATE_NONE,
+                command.limits if command else 0,
+                self._activity,
+                values["strategy"],
+            )
+        )
+        if lifecycle == "active" and controller:
+            statuses.append(
+                self._inputs.report(
+                    now_ns,
+                    controller.monitor.tallies,
+                    controller.supervision.stale,
+                    controller.monitor.verdicts,
+                    self._wheel_names,
+                )
+            )
+            statuses.append(self._loop.report(self._rate_hz, values))
+        self._activity.clear()
+        return diagnostics.to_message(now_ns, self._node_name, [*statuses, *extra])
+
+
+class ChangeDetector:
+    """Tells when something worth a report at once has changed, no more often than a least period."""
+
+    def __init__(self, least_period_s: float) -> None:
+        self._least_period_s = least_period_s
+        self._reported: object = None
+        self._reported_at_s = float("-inf")
+
+    def changed(self, state: object, time_s: float) -> bool:
+        """Whether `state` differs from the one last reported, and the last report is long enough ago."""
+        if state == self._reported or time_s - self._reported_at_s < self._least_period_s:
+            return False
+        self._reported = state
+        self._reported_at_s = time_s
+        return True
