@@ -10,6 +10,8 @@ import yaml
 
 METADATA_FILE = "metadata.yaml"
 METADATA_VERSION = 9
+#: Name of the MCAP metadata record that holds the custom metadata from the first byte on, for the case of a crash.
+CUSTOM_METADATA = "iwm_power_manager"
 
 #: A duration that never ends, as ROS writes it: the largest number of nanoseconds in an int64.
 INFINITE_NS = 2**63 - 1

@@ -18,8 +18,8 @@ from typing import Any, NamedTuple, Self
 import yaml
 
 from ..errors import BagError
-from .mcap_scan import McapScan
-from .metadata import METADATA_FILE, Qos, Topic
+from .mcap_scan import McapChannel, McapScan
+from .metadata import CUSTOM_METADATA, METADATA_FILE, Qos, Topic
 
 _SUFFIXES = (".mcap", ".db3")
 _COMPRESSED_SUFFIX = ".zstd"
@@ -162,7 +162,7 @@ class BagReader:
                 self._damage.append(f"{name}: is missing")
         return present or sorted(
             (entry for entry in self.path.iterdir() if entry.name.removesuffix(_COMPRESSED_SUFFIX).endswith(_SUFFIXES)),
-            key=_natural,
+            key=recording_order,
         )
 
     def _open(self, path: Path) -> _McapSource | _SqliteSource:
@@ -199,24 +199,10 @@ class _McapSource:
         return self._scan.damage
 
     def topics(self) -> list[Topic]:
-        return [
-            Topic(
-                channel.topic,
-                channel.schema.name,
-                channel.schema.text if channel.schema.encoding == "ros2msg" else "",
-                channel.metadata.get("topic_type_hash", ""),
-                parse_qos(channel.metadata.get("offered_qos_profiles", "")),
-            )
-            for channel in self._scan.channels.values()
-            if channel.encoding == "cdr"
-        ]
+        return [topic_of(channel) for channel in self._scan.channels.values() if channel.encoding == "cdr"]
 
     def custom_data(self) -> dict[str, str]:
-        values: dict[str, str] = {}
-        for name, content in self._scan.metadata:
-            if name == "iwm_power_manager":
-                values.update(content)
-        return values
+        return custom_data_of(self._scan)
 
     def messages(self) -> Iterator[Message]:
         scan = self._scan
@@ -289,6 +275,26 @@ class _SqliteSource:
             return {}  # bags older than Iron carry no definitions
 
 
+def topic_of(channel: McapChannel) -> Topic:
+    """The topic an MCAP channel stands for."""
+    return Topic(
+        channel.topic,
+        channel.schema.name,
+        channel.schema.text if channel.schema.encoding == "ros2msg" else "",
+        channel.metadata.get("topic_type_hash", ""),
+        parse_qos(channel.metadata.get("offered_qos_profiles", "")),
+    )
+
+
+def custom_data_of(scan: McapScan) -> dict[str, str]:
+    """Custom metadata that our recorder put into an MCAP file."""
+    values: dict[str, str] = {}
+    for name, content in scan.metadata:
+        if name == CUSTOM_METADATA:
+            values.update(content)
+    return values
+
+
 def parse_qos(text: str) -> tuple[Qos, ...]:
     """Profiles from the YAML of a channel, of any rosbag2 version; empty where it cannot be understood."""
     try:
@@ -345,7 +351,7 @@ def _chain(streams: list[Iterator[Message]]) -> Iterator[Message]:
         yield from stream
 
 
-def _natural(path: Path) -> tuple[int, str]:
+def recording_order(path: Path) -> tuple[int, str]:
     """`bag_10.mcap` comes after `bag_9.mcap`."""
     digits = path.name.split(".", 1)[0].rpartition("_")[2]
     return (int(digits) if digits.isdigit() else 0, path.name)

@@ -189,8 +189,10 @@ class Recording:
         return self._call(self._snapshot)
 
     def add_custom_data(self, values: Mapping[str, str]) -> None:
-        """Add to the metadata of this bag and the following ones."""
-        self._call(lambda: self._add_custom_data(values))
+        """Add to the metadata of this bag and the following ones; does not wait."""
+        with self._wake:
+            self._queue.append(lambda: self._add_custom_data(values))
+            self._wake.notify()
 
     def close(self) -> None:
         """Write what is queued, close the bag if there is one, end the thread.
@@ -203,8 +205,7 @@ class Recording:
         if not self._thread.is_alive():
             return
         try:
-            if self._call(lambda: self._state) == RECORDING:
-                self.stop()
+            self._call(lambda: self._stop() if self._writer is not None else self.path)
         finally:
             with self._wake:
                 self._closing = True
@@ -237,6 +238,8 @@ class Recording:
                 future.set_result(result)
 
         with self._wake:
+            if self._closing:
+                raise BagError("the recorder is closing")
             self._queue.append(run)
             self._wake.notify()
         return future.result()
@@ -249,13 +252,23 @@ class Recording:
                 item = self._queue.popleft() if self._queue else None
                 if item is None and self._closing:
                     return
-            if callable(item):
-                item()
-            elif item is not None:
-                self._take(item)
-            if self._writer is not None and time.monotonic() - self._last_flush >= self.options.flush_period_s:
-                self._flush(self._writer)
+            try:
+                if callable(item):
+                    item()
+                elif item is not None:
+                    self._take(item)
+                if self._writer is not None and time.monotonic() - self._last_flush >= self.options.flush_period_s:
+                    self._flush(self._writer)
+            except Exception as error:  # noqa: BLE001 - a fault here must end as a failed recording, not in silence
+                self._give_up(error)
             self._publish()
+
+    def _give_up(self, error: Exception) -> None:
+        self._error = f"internal error: {error!r}"
+        if self._writer is not None:
+            self._fail(self._writer, BagError(self._error))
+        self._state = FAILED
+        self.failed.set()
 
     def _publish(self) -> None:
         writer = self._writer

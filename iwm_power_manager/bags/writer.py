@@ -7,7 +7,7 @@ each file carries every schema and the custom metadata, so that each can be read
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -17,6 +17,7 @@ from ..errors import BagError, ConfigError
 from ..files import atomic_write
 from .mcap_file import COMPRESSIONS, McapFile
 from .metadata import (
+    CUSTOM_METADATA,
     METADATA_FILE,
     FileSpan,
     Topic,
@@ -27,9 +28,6 @@ from .metadata import (
 )
 
 LIBRARY = f"iwm_power_manager {__version__}"
-#: Name of the MCAP metadata record that holds the custom metadata from the first byte on, for the case of a crash.
-CUSTOM_METADATA = "iwm_power_manager"
-
 DEFAULT_CHUNK_BYTES = 786_432
 
 
@@ -129,7 +127,7 @@ class BagWriter:
         self._topics.append(topic)
         self._counts.append(0)
         try:
-            self._channels.append(self._add_channel(self._file, topic))
+            self._channels.append(announce(self._file, topic))
         except OSError as error:
             raise self._failed(error) from None
         return len(self._topics) - 1
@@ -223,51 +221,61 @@ class BagWriter:
             )
             if self.custom_data:
                 file.add_metadata(CUSTOM_METADATA, self.custom_data)
-            self._channels = [self._add_channel(file, topic) for topic in self._topics]
+            self._channels = [announce(file, topic) for topic in self._topics]
         except OSError as error:
             raise self._failed(error) from None
         self._file_has_message = False
         return file
 
-    def _add_channel(self, file: McapFile, topic: Topic) -> int:
-        schema = file.schema_id(topic.type, "ros2msg" if topic.definition else "", topic.definition)
-        return file.add_channel(
-            topic.name, schema, {"offered_qos_profiles": qos_text(topic.qos), "topic_type_hash": topic.type_hash}
-        )
-
     def _finish_file(self) -> None:
         file = self._file
         try:
-            file.flush()
-            span = self._span(file)
-            information = bag_information("mcap", [span], self._topic_counts(file), self.custom_data)
-            file.add_metadata("rosbag2", {"serialized_metadata": information_text(information)})
-            file.finish()
+            finish(file, list(zip(self._topics, self._channels, strict=True)), self.custom_data)
         except OSError as error:
             file.abandon()
             raise self._failed(error) from None
         finally:
             for index, channel in enumerate(self._channels):
                 self._counts[index] += file.channel_counts.get(channel, 0)
-            self._spans.append(self._span(file))
+            self._spans.append(span_of(file))
             self._closed_bytes += file.size_bytes
-
-    def _topic_counts(self, file: McapFile) -> list[tuple[Topic, int]]:
-        return [
-            (topic, file.channel_counts[channel]) for topic, channel in zip(self._topics, self._channels, strict=True)
-        ]
-
-    @staticmethod
-    def _span(file: McapFile) -> FileSpan:
-        return FileSpan(file.path.name, file.start_time_ns, file.end_time_ns, file.message_count)
 
     def _write_metadata(self) -> None:
         topics = list(zip(self._topics, self._counts, strict=True))
-        text = metadata_text(bag_information("mcap", self._spans, topics, self.custom_data))
-        try:
-            atomic_write(self.path / METADATA_FILE, text.encode())
-        except (ConfigError, OSError) as error:
-            raise BagError(f"{self.path}: metadata.yaml cannot be written: {error}") from None
+        write_metadata(self.path, self._spans, topics, self.custom_data)
 
     def _failed(self, error: OSError) -> BagError:
         return BagError(f"{self.path}: cannot be written: {error.strerror or os.fspath(self.path)}")
+
+
+def announce(file: McapFile, topic: Topic) -> int:
+    """Write a topic's schema and channel into a file; returns the channel's id."""
+    schema = file.schema_id(topic.type, "ros2msg" if topic.definition else "", topic.definition)
+    return file.add_channel(
+        topic.name, schema, {"offered_qos_profiles": qos_text(topic.qos), "topic_type_hash": topic.type_hash}
+    )
+
+
+def finish(file: McapFile, channels: Sequence[tuple[Topic, int]], custom_data: Mapping[str, str]) -> None:
+    """Complete a file with the metadata rosbag2 keeps inside, and close it."""
+    file.flush()
+    counts = [(topic, file.channel_counts[channel]) for topic, channel in channels]
+    information = bag_information("mcap", [span_of(file)], counts, custom_data)
+    file.add_metadata("rosbag2", {"serialized_metadata": information_text(information)})
+    file.finish()
+
+
+def span_of(file: McapFile) -> FileSpan:
+    """Time span and count of what is in a file."""
+    return FileSpan(file.path.name, file.start_time_ns, file.end_time_ns, file.message_count)
+
+
+def write_metadata(
+    folder: Path, spans: Sequence[FileSpan], topics: Sequence[tuple[Topic, int]], custom_data: Mapping[str, str]
+) -> None:
+    """Write a bag's `metadata.yaml`; `BagError` if it cannot be."""
+    text = metadata_text(bag_information("mcap", spans, topics, custom_data))
+    try:
+        atomic_write(folder / METADATA_FILE, text.encode())
+    except ConfigError as error:
+        raise BagError(str(error)) from None

@@ -6,6 +6,7 @@ Three threads share the work: this module's main loop takes messages from DDS (`
 
 from __future__ import annotations
 
+import argparse
 import math
 import re
 import signal
@@ -34,6 +35,7 @@ from ..bags.definitions import definition_of
 from ..bags.mcap_file import COMPRESSIONS
 from ..bags.metadata import Topic
 from ..bags.recording import FAILED, Recording, RecordingOptions, Sample
+from ..bags.recover import recover
 from ..bags.writer import WriterOptions
 from ..errors import BagError, IwmError
 from ..files import sha256_of
@@ -50,6 +52,8 @@ from ..ros.messages import (
 )
 from ..ros.parameters import Change, ParameterError, Spec, Value, declare
 from ..ros.raw import RawSubscriptions, Taken
+from ..ros.remote_parameters import RemoteParameters
+from ..share import resolve
 
 DIAGNOSTICS = "/diagnostics"
 DEFAULT_TOPICS = [*TOPIC_TYPES, DIAGNOSTICS]
@@ -106,6 +110,7 @@ PARAMETERS = (
     _spec("poll_period_s", 0.02, "Time between two rounds of taking messages, s.", 0.001, 0.2),
     _spec("snapshot_s", 0.0, "Time span kept in memory for ~/snapshot, s; 0: none.", 0.0, 3600.0),
     _spec("snapshot_bytes", 64 * _MEBIBYTE, "Memory for the snapshot, bytes; the oldest go first.", 1024, 2**40),
+    _spec("node_parameters", True, "Put the parameters of the nodes that publish into the bag's metadata."),
     _spec("exit_on_error", True, "End with an error when recording fails; false: stay and report."),
     _spec("policy_file", "", "Policy of the drive; its name and SHA-256 go into the bag's metadata."),
     _spec("vehicle_file", "", "Vehicle of the drive; its name and SHA-256 go into the bag's metadata."),
@@ -129,6 +134,7 @@ class Recorder(Node):
         self._wait_for = [self.resolve_topic_name(name) for name in values["wait_for"] if name]
         self._poll_s = values["poll_period_s"]
         self._exit_on_error = values["exit_on_error"]
+        self._remote_parameters = RemoteParameters(self) if values["node_parameters"] else None
         self._clock_topic = -1
         self._now_ns: int | None = None
         self._held: list[Taken] = []
@@ -206,6 +212,13 @@ class Recorder(Node):
                 raise AssertionError("topics are announced in the order they are found")
             if topic.name == CLOCK:
                 self._clock_topic = number
+            if self._remote_parameters is not None:
+                for publisher in topic.publishers:
+                    self._remote_parameters.ask(publisher)
+        if self._remote_parameters is not None:
+            answers = self._remote_parameters.answers()
+            if answers:
+                self.recording.add_custom_data({f"parameters {name}": text for name, text in answers.items()})
         self._update_ready(now)
 
     def _update_ready(self, now: float) -> None:
@@ -325,10 +338,10 @@ def _options(values: Mapping[str, Any]) -> RecordingOptions:
 def _custom_data(values: Mapping[str, Any]) -> dict[str, str]:
     custom = {"package_version": __version__}
     for kind in _IDENTIFIED_FILES:
-        name = values[f"{kind}_file"]
-        if name:
-            custom[f"{kind}_file"] = Path(name).name
-            custom[f"{kind}_sha256"] = sha256_of(name)
+        if values[f"{kind}_file"]:
+            path = resolve(values[f"{kind}_file"])
+            custom[f"{kind}_file"] = path.name
+            custom[f"{kind}_sha256"] = sha256_of(path)
     for pair in filter(None, values["metadata"]):
         key, _, value = pair.partition("=")
         if not (key and value):
@@ -343,21 +356,54 @@ def _spin(executor: SingleThreadedExecutor) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until Ctrl-C or SIGTERM; returns the exit code."""
+    """Run the node until Ctrl-C or SIGTERM, or recover bags; returns the exit code."""
+    arguments = list(sys.argv[1:] if args is None else args)
+    folders = _parser().parse_args(
+        arguments[: arguments.index("--ros-args")] if "--ros-args" in arguments else arguments
+    )
+    try:
+        if folders.recover:
+            return _recover(folders.recover)
+        return _run_node(arguments)
+    except IwmError as error:
+        print(f"recorder: {error}", file=sys.stderr)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    width = max(len(spec.name) for spec in PARAMETERS)
+    parameters = "\n".join(f"  {spec.name:{width}}  {spec.description}" for spec in PARAMETERS)
+    parser = argparse.ArgumentParser(
+        prog="recorder",
+        usage="recorder [--ros-args -p NAME:=VALUE ... | --params-file FILE | -r FROM:=TO]\n"
+        "       recorder --recover DIR ...",
+        description="Record topics to a rosbag2 MCAP bag until Ctrl-C, or make a valid bag of what a crash left.",
+        epilog=f"parameters:\n{parameters}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--recover", metavar="DIR", nargs="+", help="rebuild index and metadata of bags whose recorder was killed"
+    )
+    return parser
+
+
+def _recover(folders: Sequence[str]) -> int:
+    for folder in folders:
+        print("\n".join(recover(folder).lines()))
+    return 0
+
+
+def _run_node(arguments: list[str]) -> int:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     try:
         # rclpy's own handlers would close DDS before the last messages are taken.
-        rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=["recorder", *arguments], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # rcl's only word for a wrong --ros-args
-        print(f"recorder: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
+        raise ParameterError(" ".join(str(error).split())) from None
     try:
         return _record(stop)
-    except IwmError as error:
-        print(f"recorder: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
     finally:
         rclpy.try_shutdown()
 

@@ -44,13 +44,14 @@ class _Unattended(CallbackGroup):
 
 
 class FoundTopic(NamedTuple):
-    """A topic that `RawSubscriptions` has just subscribed to."""
+    """A topic that `RawSubscriptions` has just subscribed to; `publishers` are full node names."""
 
     number: int
     name: str
     type: str
     type_hash: str
     offered: tuple[Qos, ...]
+    publishers: tuple[str, ...]
 
 
 class _Topic:
@@ -227,6 +228,7 @@ def _found(topic: _Topic, msgtype: str, publishers: Sequence[TopicEndpointInfo])
         msgtype,
         known if known.startswith("RIHS01_") else "",
         tuple(dict.fromkeys(_offered(info.qos_profile) for info in publishers)),
+        tuple(dict.fromkeys(f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in publishers)),
     )
 
 
