@@ -14,6 +14,7 @@ cost-to-go there would be that of driving at this power for ever.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -109,13 +110,14 @@ def cycle_source(cycle: Cycle, dt_s: float, vehicle: VehicleParams, weight: floa
 
 def signal_source(
     name: str,
-    sha256: str,
     time_s: NDArray[np.float64],
     power_w: NDArray[np.float64],
     dt_s: float,
     weight: float = 1.0,
 ) -> Source:
     """A recorded demand signal as a source: cut at gaps, each piece sampled at the decision step.
+
+    Its hash is that of the signal, so that a bag that was only split or compressed anew still counts as the same.
 
     Samples that are not finite and times that do not increase are left out.
 
@@ -136,7 +138,8 @@ def signal_source(
         if times.size >= 2 and times[-1] - times[0] >= dt_s:
             steps = int((times[-1] - times[0]) / dt_s + 1e-9)
             sequences.append(np.interp(times[0] + np.arange(steps + 1) * dt_s, times, values))
-    return Source(name, sha256, weight, tuple(sequences))
+    digest = hashlib.sha256(time_s.tobytes() + power_w.tobytes()).hexdigest()
+    return Source(name, digest, weight, tuple(sequences))
 
 
 def nearest_bin(axis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.int64]:

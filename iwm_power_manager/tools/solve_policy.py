@@ -1,0 +1,400 @@
+"""Solve power-split policies: `solve_policy --help`.
+
+Exit codes: 0 solved (or checked); 1 a policy did not reach its bound; 2 bad arguments or files; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import re
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from iwm_power_manager import __version__
+from iwm_power_manager.bags.mapping import load_mapping
+from iwm_power_manager.bags.signals import read_signal
+from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.errors import ConfigError, IwmError
+from iwm_power_manager.files import atomic_write, check_number
+from iwm_power_manager.mdp.certify import bellman_bound
+from iwm_power_manager.mdp.demand import (
+    THIN_ROW_STEPS,
+    DemandChain,
+    Source,
+    cycle_source,
+    demand_chain,
+    signal_source,
+)
+from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
+from iwm_power_manager.mdp.problem import Problem, load_problem
+from iwm_power_manager.mdp.transitions import build_model
+from iwm_power_manager.policy import Policy, cost_quantum_j, load_policy, make_policy, save_policy
+from iwm_power_manager.share import resolve
+from iwm_power_manager.tools.solver_figures import draw_solution
+from iwm_power_manager.vehicle import IDLE_DRIVES, Vehicle, load_vehicle
+
+SOLVED, UNSOLVED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+_DESCRIPTION = """\
+Solve the stochastic power split of a car and write it as policy files.
+
+The driver's power demand becomes a Markov chain, counted from drive cycles and from recorded driving. For every state
+(demand, speed, slip of both axles, previous front share) policy iteration then finds the front share with the least
+expected, discounted cost: battery energy, undelivered power, switching. It stops when the cost-to-go is certified to
+be within the grid's tolerance of the optimum; the table shows how it got there.
+"""
+
+_EXAMPLES = """\
+examples:
+  The paper's problem, for a dry, a wet and an icy road, one file each:
+    solve_policy --vehicle jalalmaab_2015 --cycle ftp75 --cycle hwfet --cycle nycc \\
+                 --grid paper --friction 0.9 0.5 0.2 --output policies/
+
+  From what your own car recorded, each second of it counting as much as ten of the cycle, with a picture:
+    solve_policy --vehicle my_car.yaml --cycle udds.csv --bag drive_1 --bag drive_2 --bag-weight 10 \\
+                 --mapping my_topics.yaml --friction 0.9 --output policies/ --plot solution.png
+
+  Your own grid: copy config/grids/fine.yaml, edit it, and pass the file:
+    solve_policy --vehicle my_car.yaml --cycle udds.csv --grid my_grid.yaml --friction 0.9 --output my_policy.npz
+
+  Check that a policy file belongs to a car and keeps the bound it claims:
+    solve_policy --vehicle my_car.yaml --check my_policy.npz
+
+Vehicles, cycles and grids that come with the package are found by name. The same inputs give the same file, byte for
+byte. Results go to stdout, progress to stderr.
+
+exit codes: 0 solved or checked, 1 a policy missed its bound, 2 bad arguments or files, 130 interrupted
+"""
+
+
+class Solved(NamedTuple):
+    """One policy, where it was written and what it took."""
+
+    policy: Policy
+    path: Path
+    build_s: float
+    solve_s: float
+
+
+def parser() -> argparse.ArgumentParser:
+    """Arguments of the command."""
+    result = argparse.ArgumentParser(
+        prog="solve_policy",
+        description=_DESCRIPTION,
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    problem = result.add_argument_group("problem")
+    problem.add_argument("--vehicle", required=True, metavar="FILE", help="car, YAML (config/vehicles/)")
+    problem.add_argument(
+        "--friction", nargs="+", type=float, metavar="MU", help="peak friction coefficient(s): one policy each"
+    )
+    problem.add_argument(
+        "--grid", default="fine", metavar="NAME|FILE", help="paper, fine or a YAML file (default: %(default)s)"
+    )
+    problem.add_argument("--idle-drive", choices=sorted(IDLE_DRIVES), help="replaces the car's idle_drive")
+    problem.add_argument("--discount", type=float, metavar="GAMMA", help="replaces the grid's discount")
+
+    demand = result.add_argument_group("demand")
+    demand.add_argument(
+        "--cycle", action="append", default=[], metavar="CSV", help="time_s,speed_mps[,grade]; repeat for more"
+    )
+    demand.add_argument(
+        "--bag",
+        action="append",
+        default=[],
+        metavar="BAG",
+        help="rosbag2 recording with a power demand; repeat for more",
+    )
+    demand.add_argument("--mapping", metavar="YAML", help="topics and units of foreign bags (config/bags/)")
+    demand.add_argument(
+        "--bag-weight",
+        type=float,
+        default=1.0,
+        metavar="W",
+        help="a recorded second counts as W seconds of a cycle (default: %(default)s)",
+    )
+
+    output = result.add_argument_group("output")
+    output.add_argument("--output", metavar="DIR|FILE", help="folder for the policies, or a .npz file for a single one")
+    output.add_argument("--plot", metavar="PNG", help="picture of transition matrix, convergence and policy")
+    output.add_argument("--json", metavar="FILE", help="the run's numbers")
+    output.add_argument("--quiet", action="store_true", help="print errors only")
+    output.add_argument("--check", nargs="+", metavar="POLICY", help="verify policy files instead of solving")
+    output.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    return result
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    options = parser().parse_args(arguments)
+    try:
+        return _check(options) if options.check else _solve(options)
+    except IwmError as error:
+        print(f"solve_policy: error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("solve_policy: interrupted; nothing half-written is left", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _solve(options: argparse.Namespace) -> int:
+    _demand_arguments(options)
+    vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
+    problem = _problem(options)
+    frictions = [check_number("arguments", "--friction", value, 0.01, 2.0) for value in options.friction]
+    targets = _targets(Path(options.output), vehicle, problem, frictions)
+    say = _silent if options.quiet else print
+
+    sources = _sources(options, problem.dt_s, vehicle)
+    chain = demand_chain(problem.power_w, sources)
+    say(_problem_text(problem, vehicle))
+    say(_demand_text(chain, sources, problem.dt_s))
+    for warning in demand_warnings(chain, problem.dt_s):
+        print(f"solve_policy: warning: {warning}", file=sys.stderr)
+
+    solved = []
+    for friction, path in zip(frictions, targets, strict=True):
+        solved.append(solve_one(problem, vehicle, friction, chain, sources, path, options.quiet))
+        say(_convergence_text(solved[-1]))
+    if options.plot:
+        draw_solution([result.policy for result in solved], Path(options.plot))
+        say(f"picture: {options.plot}")
+    if options.json:
+        atomic_write(options.json, json.dumps(_numbers(chain, sources, solved), indent=1).encode())
+    return SOLVED if all(result.policy.converged for result in solved) else UNSOLVED
+
+
+def _demand_arguments(options: argparse.Namespace) -> None:
+    """What argparse cannot say: needed for solving, but not for --check."""
+    for name in ("friction", "output"):
+        if not getattr(options, name):
+            raise ConfigError("arguments", f"--{name}", "is missing")
+    if not options.cycle and not options.bag:
+        raise ConfigError("arguments", "--cycle", "is missing", "one cycle or bag, or more")
+    check_number("arguments", "--bag-weight", options.bag_weight, 0.0, 1e6, above=True)
+
+
+def _problem(options: argparse.Namespace) -> Problem:
+    preset = resolve(f"config/grids/{options.grid}.yaml")
+    problem = load_problem(preset if preset.exists() else resolve(options.grid))
+    if options.discount is None:
+        return problem
+    discount = check_number("arguments", "--discount", options.discount, 0.0, 0.9999)
+    return dataclasses.replace(problem, discount=discount)
+
+
+def _sources(options: argparse.Namespace, dt_s: float, vehicle: Vehicle) -> list[Source]:
+    sources = [cycle_source(load_cycle(resolve(path)), dt_s, vehicle.params) for path in options.cycle]
+    mapping = load_mapping(resolve(options.mapping) if options.mapping else None) if options.bag else None
+    for path in options.bag:
+        drive = read_signal(path, mapping, vehicle.params)
+        for damage in drive.damage:
+            print(f"solve_policy: warning: {path}: {damage}", file=sys.stderr)
+        if drive.bad_messages:
+            print(f"solve_policy: warning: {path}: {drive.bad_messages} bad messages left out", file=sys.stderr)
+        sources.append(signal_source(Path(path).name, drive.time_s, drive.power_demand_w, dt_s, options.bag_weight))
+    return sources
+
+
+def _targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequence[float]) -> list[Path]:
+    """Where each policy goes; a folder is made, a file is for one policy only."""
+    if len(set(frictions)) != len(frictions):
+        raise ConfigError("arguments", "--friction", "names a value twice")
+    if output.suffix == ".npz":
+        if len(frictions) > 1:
+            raise ConfigError(
+                "arguments", "--output", f"{output} is one file for {len(frictions)} policies", "a folder"
+            )
+        return [output]
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError("arguments", "--output", f"{output}: {error.strerror}", "a folder or a .npz file") from None
+    stem = re.sub(r"[^a-z0-9]+", "_", f"{vehicle.name} {vehicle.idle_drive} {problem.name}".lower()).strip("_")
+    return [output / f"{stem}_mu{round(friction * 100):03d}.npz" for friction in frictions]
+
+
+def solve_one(
+    problem: Problem,
+    vehicle: Vehicle,
+    friction: float,
+    chain: DemandChain,
+    sources: Sequence[Source],
+    path: Path,
+    quiet: bool = True,
+) -> Solved:
+    """Solve for one road, write the policy, and say what it took."""
+    started = time.perf_counter()
+    with _Progress(f"friction {friction:g}", problem.tolerance_j, quiet) as progress:
+        model = build_model(problem, vehicle.params, friction, chain.probability)
+        built = time.perf_counter()
+        solution: Solution = solve(
+            model,
+            problem.share,
+            # What rounding the stored cost-to-go adds is part of the promise.
+            problem.tolerance_j - cost_quantum_j(problem.tolerance_j) / 2.0,
+            problem.max_iterations,
+            progress.update,
+        )
+        done = time.perf_counter()
+    policy = make_policy(problem, vehicle, friction, chain, sources, solution)
+    save_policy(policy, path)
+    return Solved(policy, path, built - started, done - built)
+
+
+class _Progress:
+    """A bar over the orders of magnitude from the first bound to the tolerance."""
+
+    def __init__(self, label: str, tolerance_j: float, quiet: bool) -> None:
+        self._tolerance = tolerance_j
+        self._first = 0.0
+        self._bar = tqdm(
+            total=100,
+            desc=f"{label}: tabulating",
+            unit="%",
+            bar_format="{desc} |{bar}| {n_fmt}% [{elapsed}]{postfix}",
+            file=sys.stderr,
+            disable=quiet,
+            leave=False,
+        )
+        self._label = label
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def update(self, iteration: Iteration) -> None:
+        """Show one more policy."""
+        bound = max(iteration.bound_j, self._tolerance)
+        if self._first == 0.0:
+            self._first = bound
+            self._bar.set_description(f"{self._label}: solving")
+        span = math.log(self._first / self._tolerance)
+        self._bar.n = round(100.0 * (math.log(self._first / bound) / span if span > 0.0 else 1.0))
+        self._bar.set_postfix_str(f"policy {iteration.number}, bound {iteration.bound_j:.3g} J")
+
+
+def _check(options: argparse.Namespace) -> int:
+    """Verify policy files against a car: identity, integrity, and the bound, computed anew."""
+    vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
+    kept = True
+    for name in options.check:
+        path = resolve(name)
+        policy = load_policy(path)
+        policy.check_vehicle(vehicle, str(path))
+        model = build_model(policy.problem, vehicle.params, policy.friction, policy.chain.probability)
+        powers, speeds, fronts, rears, shares = policy.problem.shape
+        cost = policy.cost_j.reshape(powers, speeds * fronts * rears, shares).transpose(0, 2, 1)
+        bound = bellman_bound(model, np.ascontiguousarray(cost))
+        # The residual's bound is wider than the solver's: it bounds the stored cost-to-go without centring it.
+        claimed = policy.bound_j * (1.0 + policy.problem.discount) / (1.0 - policy.problem.discount)
+        good = bound <= claimed + 1e-9 * float(np.max(np.abs(cost)))
+        kept = kept and good
+        if not options.quiet or not good:
+            verdict = "ok" if good else "does NOT keep its bound"
+            print(
+                f"{path}: {verdict}; friction {policy.friction:g}, {policy.vehicle_name}, {policy.checksum[:12]}, "
+                f"claims {policy.bound_j:.3g} J, Bellman residual proves {bound:.3g} J"
+            )
+    return SOLVED if kept else UNSOLVED
+
+
+def demand_warnings(chain: DemandChain, dt_s: float) -> list[str]:
+    """What is thin about the demand's data, one line each."""
+    lines = []
+    if chain.unvisited_w.size:
+        lines.append(f"no data at {_kilowatts(chain.unvisited_w)} kW: taken to return to the nearest demand with data")
+    if chain.thin_w.size:
+        lines.append(f"less than {THIN_ROW_STEPS * dt_s:g} s of data at {_kilowatts(chain.thin_w)} kW")
+    if chain.clipped > 0.01:
+        lines.append(f"{chain.clipped:.1%} of the demand lies outside the power axis and counts as its end")
+    return lines
+
+
+def _kilowatts(values: np.ndarray[Any, Any]) -> str:
+    return ", ".join(f"{value / 1000.0:g}" for value in values)
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+def _problem_text(problem: Problem, vehicle: Vehicle) -> str:
+    points = " x ".join(str(n) for n in problem.shape)
+    return (
+        f"{vehicle.name} (idle_drive {vehicle.idle_drive}), grid {problem.name}: {points} states "
+        f"(power, speed, slip front, slip rear, previous share), {problem.share.size} controls\n"
+        f"step {problem.dt_s:g} s, discount {problem.discount:g} (horizon {problem.dt_s / (1 - problem.discount):.3g} s), "
+        f"alpha {problem.alpha:g}, power error at the {problem.power_error} ({problem.error_norm}), slip "
+        f"{problem.slip_model}, skid avoidance {problem.skid_avoidance}, switching {problem.switching_cost_j:g} J"
+    )
+
+
+def _demand_text(chain: DemandChain, sources: Sequence[Source], dt_s: float) -> str:
+    lines = ["demand from " + ", ".join(f"{s.name} ({s.steps * dt_s:.0f} s x {s.weight:g})" for s in sources)]
+    lines.append("seconds of data by demand in kW:")
+    cells = [
+        f"{power / 1000.0:6.4g}: {steps * dt_s:<8.1f}"
+        for power, steps in zip(chain.power_w, chain.row_steps, strict=True)
+    ]
+    lines += ["  " + "".join(cells[i : i + 8]).rstrip() for i in range(0, len(cells), 8)]
+    return "\n".join(lines)
+
+
+def _convergence_text(result: Solved) -> str:
+    policy = result.policy
+    lines = [f"\nfriction {policy.friction:g}", "policy    sweeps     bound J   norm of change   changed states"]
+    lines += [
+        f"{i.number:6d} {i.evaluation_sweeps:9d} {i.bound_j:11.3e} {i.policy_change:16.6g} {i.changed_states:16d}"
+        for i in policy.iterations
+    ]
+    verdict = "certified" if policy.converged else "NOT within the tolerance: only certified"
+    lines.append(
+        f"{verdict} to {policy.bound_j:.2g} J in {result.build_s:.2f} + {result.solve_s:.2f} s (tabulate + solve)\n"
+        f"policy: {result.path} ({result.path.stat().st_size / 1e3:.0f} kB, {policy.checksum[:12]})"
+    )
+    return "\n".join(lines)
+
+
+def _numbers(chain: DemandChain, sources: Sequence[Source], solved: Sequence[Solved]) -> dict[str, Any]:
+    """The run's numbers, for --json."""
+    return {
+        "package_version": __version__,
+        "demand": {
+            "power_w": chain.power_w.tolist(),
+            "row_steps": chain.row_steps.tolist(),
+            "probability": chain.probability.tolist(),
+            "clipped": chain.clipped,
+            "sources": [{"name": s.name, "sha256": s.sha256, "weight": s.weight, "steps": s.steps} for s in sources],
+        },
+        "policies": [
+            {
+                "friction": result.policy.friction,
+                "path": str(result.path),
+                "checksum": result.policy.checksum,
+                "vehicle_hash": result.policy.vehicle_hash,
+                "bound_j": result.policy.bound_j,
+                "converged": result.policy.converged,
+                "build_s": result.build_s,
+                "solve_s": result.solve_s,
+                "iterations": [iteration._asdict() for iteration in result.policy.iterations],
+            }
+            for result in solved
+        ],
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())
