@@ -375,6 +375,14 @@ def _evaluate_policy(operator: _Operator, policy: NDArray[np.int16], cost: NDArr
             rho = rho_next
 
 
+def _gated_mask(model: Model) -> NDArray[np.bool_]:
+    """Mark the states with a single action: bool[P, S, C]."""
+    powers, shares, cells = model.state_shape
+    mask = np.zeros((powers, cells), dtype=np.bool_)
+    mask[np.repeat(np.arange(powers), np.diff(model.gated_start)), model.gated_cell] = True
+    return np.broadcast_to(mask[:, None, :], (powers, shares, cells))
+
+
 def certified_bound(discount: float, difference: NDArray[np.float64]) -> tuple[float, float]:
     """Shift and max-norm bound (J) from the Bellman difference T J - J: J* = T J + shift, give or take the bound."""
     low, high = float(np.min(difference)), float(np.max(difference))
@@ -407,7 +415,8 @@ def solve(
     operator = _Operator(model)
     cost = np.zeros(model.state_shape)
     improved = np.empty_like(cost)
-    policy = np.full(cost.shape, GATED, dtype=np.int16)
+    # What the first policy is compared with: equal split.
+    policy = np.where(_gated_mask(model), np.int16(GATED), np.int16(np.argmin(np.abs(share - 0.5))))
     previous = np.empty_like(policy)
     history: list[Iteration] = []
     share_of = np.append(share, 0.0)  # the last entry serves GATED = -1
@@ -420,7 +429,7 @@ def solve(
         difference = np.subtract(improved, cost, out=cost)
         residual = float(np.max(np.abs(difference)))
         shift, bound = certified_bound(model.discount, difference)
-        change = share_of[policy] - share_of[previous] if history else share_of[policy]
+        change = share_of[policy] - share_of[previous]
         history.append(
             Iteration(
                 number=len(history) + 1,

@@ -280,7 +280,7 @@ class _Progress:
         bound = max(iteration.bound_j, self._tolerance)
         if self._first == 0.0:
             self._first = bound
-            self._bar.set_description(f"{self._label}: solving")
+            self._bar.set_description_str(f"{self._label}: solving")
         span = math.log(self._first / self._tolerance)
         self._bar.n = round(100.0 * (math.log(self._first / bound) / span if span > 0.0 else 1.0))
         self._bar.set_postfix_str(f"policy {iteration.number}, bound {iteration.bound_j:.3g} J")
@@ -298,7 +298,7 @@ def _check(options: argparse.Namespace) -> int:
         powers, speeds, fronts, rears, shares = policy.problem.shape
         cost = policy.cost_j.reshape(powers, speeds * fronts * rears, shares).transpose(0, 2, 1)
         bound = bellman_bound(model, np.ascontiguousarray(cost))
-        # The residual's bound is wider than the solver's: it bounds the stored cost-to-go without centring it.
+        # A cost-to-go within b of the optimum has a residual of at most (1 + gamma) b.
         claimed = policy.bound_j * (1.0 + policy.problem.discount) / (1.0 - policy.problem.discount)
         good = bound <= claimed + 1e-9 * float(np.max(np.abs(cost)))
         kept = kept and good
@@ -333,10 +333,11 @@ def _silent(_: str) -> None:
 
 def _problem_text(problem: Problem, vehicle: Vehicle) -> str:
     points = " x ".join(str(n) for n in problem.shape)
+    horizon = problem.dt_s / (1.0 - problem.discount)
     return (
         f"{vehicle.name} (idle_drive {vehicle.idle_drive}), grid {problem.name}: {points} states "
         f"(power, speed, slip front, slip rear, previous share), {problem.share.size} controls\n"
-        f"step {problem.dt_s:g} s, discount {problem.discount:g} (horizon {problem.dt_s / (1 - problem.discount):.3g} s), "
+        f"step {problem.dt_s:g} s, discount {problem.discount:g} (horizon {horizon:.3g} s), "
         f"alpha {problem.alpha:g}, power error at the {problem.power_error} ({problem.error_norm}), slip "
         f"{problem.slip_model}, skid avoidance {problem.skid_avoidance}, switching {problem.switching_cost_j:g} J"
     )

@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.demand import THIN_ROW_STEPS, DemandChain
@@ -69,7 +71,7 @@ def draw_convergence(axes: Axes, policies: Sequence[Policy]) -> None:
     right.set_yscale("log")
     right.set_ylabel("certified bound, J (dashed)")
     axes.set(title="Policy iteration", xlabel="policy", ylabel="norm of the change of the front share")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend()
 
 
@@ -77,7 +79,7 @@ def draw_policy(axes: Axes, policy: Policy) -> None:
     """Front share over demand and speed, at no slip and coming from equal split."""
     problem = policy.problem
 
-    def nearest(axis: np.ndarray, value: float) -> int:  # type: ignore[type-arg]
+    def nearest(axis: NDArray[np.float64], value: float) -> int:
         return int(np.argmin(np.abs(axis - value)))
 
     front, rear = nearest(problem.slip_front, 0.0), nearest(problem.slip_rear, 0.0)
