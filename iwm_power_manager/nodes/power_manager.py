@@ -14,16 +14,16 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TwistStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import BatteryState, JointState
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
@@ -33,12 +33,29 @@ from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport
 from iwm_power_manager.ros import diagnostics, messages, qos, realtime
+from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 
 _COMMANDS = (messages.WHEEL_TORQUE_COMMAND, messages.FRICTION_BRAKE_COMMAND)
+_INPUTS = (
+    messages.VEHICLE_SPEED,
+    messages.WHEEL_STATES,
+    messages.BATTERY_STATE,
+    messages.POWER_DEMAND,
+    messages.ROAD_FRICTION,
+)
+#: The stamped inputs of a lock-step set: their queue and how they are read.
+_STAMPED = (
+    (SPEED, messages.VEHICLE_SPEED, messages.read_vehicle_speed),
+    (WHEELS, messages.WHEEL_STATES, messages.read_wheel_speeds),
+    (BATTERY, messages.BATTERY_STATE, messages.read_battery_state),
+)
+#: How often, and how far apart, the rest of a set is looked for once its demand is there; later the watchdog looks.
+_SET_PATIENCE = 20
+_SET_POLL_S = 0.0002
 _ZERO = (0.0, 0.0, 0.0, 0.0)
 _NS_PER_S = 1_000_000_000
 #: The watchdog also wakes the executor often enough for signals to be noticed.
@@ -74,7 +91,8 @@ class PowerManager(LifecycleNode):
         self._queue = LockstepQueue()
         self._controller: Controller | None = None
         self._policies: Policies | None = None
-        self._subscriptions_made: list[Any] = []
+        self._intake = Intake(self)
+        self._demand_subscription: Any = None
         self._publishers_made: dict[str, Any] = {}
         self._step_timer: Any = None
         self._active = False
@@ -115,6 +133,7 @@ class PowerManager(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start commanding, from the law's initial state."""
         self._fault = ""
+        self._intake.drop_all()
         self._queue.clear()
         self._start_over()
         result = super().on_activate(state)
@@ -198,27 +217,32 @@ class PowerManager(LifecycleNode):
     def _create_entities(self) -> None:
         profile = qos.profile(lockstep=self._lockstep)
         overrides = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
+        # Who offers or asks for what cannot be met is told in the diagnostics; handlers would be waited for at each step.
+        silent = {"event_callbacks": PublisherEventCallbacks(use_default_callbacks=False)}
         self._publishers_made = {
-            topic: self.create_lifecycle_publisher(JointState, topic, profile, **overrides)
+            topic: self.create_lifecycle_publisher(JointState, topic, profile, **overrides, **silent)
             for topic in (*_COMMANDS, messages.POWER_MANAGER_STATE)
         }
-        inputs = (
-            (TwistStamped, messages.VEHICLE_SPEED, self._on_speed),
-            (JointState, messages.WHEEL_STATES, self._on_wheels),
-            (BatteryState, messages.BATTERY_STATE, self._on_battery),
-            (Float64, messages.POWER_DEMAND, self._on_demand),
-            (Float64, messages.ROAD_FRICTION, self._on_friction),
-        )
-        self._subscriptions_made = [
-            self.create_subscription(kind, topic, callback, profile, **overrides) for kind, topic, callback in inputs
-        ]
+        for topic in _INPUTS:
+            if topic != messages.POWER_DEMAND or not self._lockstep:
+                self._intake.subscribe(messages.TOPIC_TYPES[topic], topic, profile)
+        if self._lockstep:
+            self._demand_subscription = self.create_subscription(
+                Float64,
+                messages.POWER_DEMAND,
+                self._on_demand,
+                profile,
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+                **overrides,
+            )
 
     def _release(self) -> None:
-        for subscription in self._subscriptions_made:
-            self.destroy_subscription(subscription)
+        self._intake.close()
+        if self._demand_subscription is not None:
+            self.destroy_subscription(self._demand_subscription)
         for publisher in self._publishers_made.values():
             self.destroy_lifecycle_publisher(publisher)
-        self._subscriptions_made = []
+        self._demand_subscription = None
         self._publishers_made = {}
         self._controller = None
         self._policies = None
@@ -242,51 +266,52 @@ class PowerManager(LifecycleNode):
         self._last_step_ns = None
         self._answer = None
 
-    # Inputs: at once into the monitor, or, in lock-step, into the queue until a set is complete
+    # Inputs
 
-    def _on_speed(self, message: TwistStamped, info: dict[str, Any]) -> None:
-        reading = messages.read_vehicle_speed(message)
-        if self._lockstep:
-            self._push(SPEED, reading, info)
-        elif self._active and self._controller:
-            self._controller.monitor.take_speed(reading, self._now_ns())
+    def _take_inputs(self) -> None:
+        """Real time: judge the newest message of every topic."""
+        assert self._controller is not None
+        monitor, intake, now_ns = self._controller.monitor, self._intake, self._now_ns()
+        for message, _ in intake.take(messages.VEHICLE_SPEED):
+            monitor.take_speed(messages.read_vehicle_speed(message), now_ns)
+        for message, _ in intake.take(messages.WHEEL_STATES):
+            monitor.take_wheels(messages.read_wheel_speeds(message), now_ns)
+        for message, _ in intake.take(messages.BATTERY_STATE):
+            monitor.take_battery(messages.read_battery_state(message), now_ns)
+        for message, info in intake.take(messages.POWER_DEMAND):
+            # No stamp of its own: how long ago DDS sent it is all there is to tell a late one by.
+            delay_s = (time.time_ns() - info["source_timestamp"]) / _NS_PER_S
+            monitor.take_demand(messages.read_number(message), delay_s, now_ns)
+        self._take_friction(now_ns)
 
-    def _on_wheels(self, message: JointState, info: dict[str, Any]) -> None:
-        reading = messages.read_wheel_speeds(message)
-        if self._lockstep:
-            self._push(WHEELS, reading, info)
-        elif self._active and self._controller:
-            self._controller.monitor.take_wheels(reading, self._now_ns())
-
-    def _on_battery(self, message: BatteryState, info: dict[str, Any]) -> None:
-        reading = messages.read_battery_state(message)
-        if self._lockstep:
-            self._push(BATTERY, reading, info)
-        elif self._active and self._controller:
-            self._controller.monitor.take_battery(reading, self._now_ns())
+    def _take_friction(self, now_ns: int) -> None:
+        assert self._controller is not None
+        for message, _ in self._intake.take(messages.ROAD_FRICTION):
+            self._controller.monitor.take_friction(messages.read_number(message), now_ns)
 
     def _on_demand(self, message: Float64, info: dict[str, Any]) -> None:
-        demand_w = messages.read_number(message)
-        if self._lockstep:
-            self._queue.push_demand(info["source_timestamp"], demand_w)
-            self._step_complete_sets()
-        elif self._active and self._controller:
-            # No stamp of its own: how long DDS took to bring it is all there is to tell a late one by.
-            delay_s = (time.time_ns() - info["source_timestamp"]) / _NS_PER_S
-            self._controller.monitor.take_demand(demand_w, delay_s, self._now_ns())
+        """Lock-step: the demand closes a set."""
+        if self._active:
+            self._queue.push_demand(info["source_timestamp"], messages.read_number(message))
+            # Topics are not ordered among each other: what was sent before may still be a moment away.
+            for _ in range(_SET_PATIENCE):
+                self._collect_sets()
+                if not self._queue.waiting:
+                    break
+                time.sleep(_SET_POLL_S)
 
-    def _on_friction(self, message: Float64) -> None:
-        if self._active and self._controller:
-            self._controller.monitor.take_friction(messages.read_number(message), self._now_ns())
-
-    def _push(self, topic: int, reading: Any, info: dict[str, Any]) -> None:
-        self._queue.push(topic, reading.stamp_ns, info["source_timestamp"], reading)
+    def _collect_sets(self) -> None:
+        for queue, topic, read in _STAMPED:
+            for message, info in self._intake.take(topic):
+                reading = read(message)
+                self._queue.push(queue, reading.stamp_ns, info["source_timestamp"], reading)
         self._step_complete_sets()
 
     # Steps
 
     def _on_step_timer(self) -> None:
         assert self._controller is not None
+        self._take_inputs()
         now_ns = self._now_ns()
         since_s = None if self._last_step_ns is None else (now_ns - self._last_step_ns) / _NS_PER_S
         if since_s is not None and since_s <= 0.0:
@@ -395,6 +420,9 @@ class PowerManager(LifecycleNode):
         """
         controller = self._controller
         if self._active and controller:
+            if self._lockstep:
+                self._take_friction(self._now_ns())
+                self._collect_sets()
             self._choose_friction()
             standing_s = time.monotonic() - self._last_step_steady_s
             if not self._lockstep and standing_s > self._values["clock_stopped_s"]:
@@ -442,6 +470,10 @@ class PowerManager(LifecycleNode):
                     {f"{topic}: publishers": str(count) for topic, count in counts.items()},
                 )
             )
+            unmatched = self._intake.unmatched()
+            if unmatched:
+                message = f"quality of service does not match the publisher's: {', '.join(unmatched)}"
+                statuses.append(diagnostics.Status("input topics", diagnostics.ERROR, message, {}))
         return statuses
 
 

@@ -80,6 +80,11 @@ class LockstepQueue:
             min(self._stamped, key=lambda queue: queue[0].sent_ns).popleft()
         return False
 
+    @property
+    def waiting(self) -> bool:
+        """A demand is there that has not been handed out."""
+        return bool(self._demands)
+
     def clear(self) -> None:
         """Forget everything, as at activation."""
         for queue in self._stamped:
