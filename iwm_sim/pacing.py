@@ -20,12 +20,17 @@ class Exchange:
     ----------
     resend_after_s : a set without a complete answer is sent again this often
     give_up_after_s : `NoAnswerError` after this long
+
+    Attributes
+    ----------
+    awaited_ns : stamp of the set that waits for its answer; -1 if none does
+    resent, unrelated : sets sent again, and commands that answered no awaited set
     """
 
     def __init__(self, resend_after_s: float, give_up_after_s: float) -> None:
         self._resend_after_s = resend_after_s
         self._give_up_after_s = give_up_after_s
-        self._stamp_ns = -1
+        self.awaited_ns = -1
         self._asked_s = 0.0
         self._sent_s = 0.0
         self._answers: list[Wheels | None] = [None, None]
@@ -34,7 +39,7 @@ class Exchange:
 
     def ask(self, stamp_ns: int, now_s: float) -> None:
         """Begin to wait for the answer to the set with this stamp."""
-        self._stamp_ns = stamp_ns
+        self.awaited_ns = stamp_ns
         self._asked_s = self._sent_s = now_s
         self._answers = [None, None]
 
@@ -43,14 +48,14 @@ class Exchange:
 
         A command with another stamp answers a set sent twice, or is somebody else's: it is counted and left alone.
         """
-        if stamp_ns != self._stamp_ns:
+        if stamp_ns != self.awaited_ns:
             self.unrelated += 1
             return None
         self._answers[kind] = torque_nm
         motor, friction = self._answers
         if motor is None or friction is None:
             return None
-        self._stamp_ns = -1
+        self.awaited_ns = -1
         return motor, friction
 
     def overdue(self, now_s: float) -> bool:
@@ -61,13 +66,13 @@ class Exchange:
         NoAnswerError
             The set has been waiting for `give_up_after_s`.
         """
-        if self._stamp_ns < 0 or now_s - self._sent_s < self._resend_after_s:
+        if self.awaited_ns < 0 or now_s - self._sent_s < self._resend_after_s:
             return False
         if now_s - self._asked_s >= self._give_up_after_s:
             names = ("wheel_torque_command", "friction_brake_command")
             missing = " and ".join(name for name, got in zip(names, self._answers, strict=True) if got is None)
             raise NoAnswerError(
-                f"no {missing} with stamp {self._stamp_ns / 1e9:.3f} s within {self._give_up_after_s:g} s "
+                f"no {missing} with stamp {self.awaited_ns / 1e9:.3f} s within {self._give_up_after_s:g} s "
                 f"(sent {1 + self.resent} times or more): has the power manager ended, or does it run without lockstep?"
             )
         self._sent_s = now_s

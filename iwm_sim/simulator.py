@@ -18,6 +18,7 @@ from typing import cast
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -31,6 +32,7 @@ from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.ros import messages as m
 from iwm_power_manager.ros import qos
+from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.parameters import Change, Spec, Value, declare
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import IDLE_DRIVES, load_vehicle
@@ -44,6 +46,9 @@ _SETTLE_S = 0.3
 _POLL_S = 0.05
 _PROGRESS_S = 0.2
 _LAST_WORDS_S = 5.0
+#: How often, and how far apart, the other command is looked for once one is there; later the timer looks.
+_PATIENCE = 20
+_PATIENCE_S = 0.0002
 
 
 def _spec(
@@ -136,7 +141,7 @@ class Simulator(Node):
         self._pacer = Pacer(period_s, speed_factor)
         self._command_timeout_s = values["command_timeout_s"] / speed_factor
         self._command: list[Wheels] = [_NO_TORQUE, _NO_TORQUE]
-        self._command_at_s = [-math.inf, -math.inf]
+        self._received_ns = [0, 0]
         self._timeouts = 0
         self._timed_out = False
         self._phase = _Phase.WAITING
@@ -147,20 +152,30 @@ class Simulator(Node):
         profile = qos.profile(lockstep=self._lockstep)
         topics = [m.VEHICLE_SPEED, m.WHEEL_STATES, m.BATTERY_STATE, m.POWER_DEMAND]
         optional = [m.ACCELERATOR_PEDAL, m.BRAKE_PEDAL] + ([m.CLOCK] if self._simulated_time else [])
+        # Handlers of unmet quality of service would be waited for at every step; a missing match is told at the start.
+        silent = PublisherEventCallbacks(use_default_callbacks=False)
         self._outputs: dict[str, Publisher] = {
-            topic: self.create_publisher(m.TOPIC_TYPES[topic], topic, profile) for topic in (*topics, *optional)
+            topic: self.create_publisher(m.TOPIC_TYPES[topic], topic, profile, event_callbacks=silent)
+            for topic in (*topics, *optional)
         }
         self._listeners = dict.fromkeys(topics, 1)
         if values["wait_for_recorder"]:
             self._listeners = {topic: self._listeners.get(topic, 0) + 1 for topic in self._outputs}
             latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
             self.create_subscription(Bool, RECORDER_READY, self._on_recorder, latched)
-        self.create_subscription(
-            JointState, m.WHEEL_TORQUE_COMMAND, lambda message: self._on_command(MOTOR, message), profile
-        )
-        self.create_subscription(
-            JointState, m.FRICTION_BRAKE_COMMAND, lambda message: self._on_command(FRICTION, message), profile
-        )
+        self._intake = Intake(self)
+        self._intake.subscribe(JointState, m.WHEEL_TORQUE_COMMAND, profile)
+        if self._lockstep:
+            # The power manager publishes this one last: one wake-up a step is enough.
+            self.create_subscription(
+                JointState,
+                m.FRICTION_BRAKE_COMMAND,
+                self._on_friction_command,
+                profile,
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            )
+        else:
+            self._intake.subscribe(JointState, m.FRICTION_BRAKE_COMMAND, profile)
         # Wall time in every mode: this node is where simulated time comes from.
         self._wall = Clock(clock_type=ClockType.STEADY_TIME)
         self._start_s = time.monotonic()
@@ -211,6 +226,7 @@ class Simulator(Node):
         self._begun_s = now
         self._first_stamp_ns = self._period_ns if self._simulated_time else self.get_clock().now().nanoseconds
         self.get_logger().info("driving")
+        self._intake.drop_all()
         if self._lockstep:
             self._timer = self.create_timer(_POLL_S, self._look_for_answer, clock=self._wall)
             self._ask()
@@ -225,9 +241,35 @@ class Simulator(Node):
         self._exchange.ask(self._stamp_ns, time.monotonic())
         self._publish_set()
 
+    def _on_friction_command(self, message: JointState) -> None:
+        if self._phase is not _Phase.DRIVING:
+            return
+        self._answer(FRICTION, message)
+        stamp_ns = m.stamp_to_ns(message.header.stamp)
+        for _ in range(_PATIENCE):
+            self._take_motor_commands()
+            if self._exchange.awaited_ns != stamp_ns:
+                return
+            time.sleep(_PATIENCE_S)
+
+    def _take_motor_commands(self) -> None:
+        for message, _ in self._intake.take(m.WHEEL_TORQUE_COMMAND):
+            self._answer(MOTOR, message)
+
+    def _answer(self, kind: int, message: JointState) -> None:
+        torque = self._read(message)
+        if torque is None:
+            return
+        commands = self._exchange.answer(kind, m.stamp_to_ns(message.header.stamp), torque)
+        if commands is not None:
+            self._drive.advance(*commands)
+            if self._continue():
+                self._ask()
+
     def _look_for_answer(self) -> None:
+        self._take_motor_commands()
         try:
-            if self._exchange.overdue(time.monotonic()):
+            if self._phase is _Phase.DRIVING and self._exchange.overdue(time.monotonic()):
                 self.get_logger().warning(f"no answer at {self._drive.time_s:.2f} s, sending the set again")
                 self._publish_set()
         except NoAnswerError as error:
@@ -247,7 +289,13 @@ class Simulator(Node):
 
         Then the motor controllers give no torque, and the friction brakes follow the pedal by themselves.
         """
-        age_s = time.monotonic() - min(self._command_at_s)
+        for kind, topic in ((MOTOR, m.WHEEL_TORQUE_COMMAND), (FRICTION, m.FRICTION_BRAKE_COMMAND)):
+            for message, info in self._intake.take(topic):
+                torque = self._read(message)
+                if torque is not None:
+                    self._command[kind] = torque
+                    self._received_ns[kind] = info["received_timestamp"]
+        age_s = (time.time_ns() - min(self._received_ns)) / 1e9
         timed_out = age_s > self._command_timeout_s
         if timed_out and not self._timed_out:
             self._timeouts += 1
@@ -290,26 +338,16 @@ class Simulator(Node):
         )
         output[m.POWER_DEMAND].publish(m.number_message(sensors.power_demand_w))
 
-    def _on_command(self, kind: int, message: JointState) -> None:
-        if self._phase is not _Phase.DRIVING:
-            return
-        reading = m.read_torques(message)
-        torque = cast(Wheels, m.select_by_name(reading, self._wheel_names))
-        if not all(map(math.isfinite, torque)):
-            self.get_logger().warning(
-                f"a command without a finite torque for each of {', '.join(self._wheel_names)} was dropped",
-                throttle_duration_sec=1.0,
-            )
-            return
-        if not self._lockstep:
-            self._command[kind] = torque
-            self._command_at_s[kind] = time.monotonic()
-            return
-        commands = self._exchange.answer(kind, reading.stamp_ns, torque)
-        if commands is not None:
-            self._drive.advance(*commands)
-            if self._continue():
-                self._ask()
+    def _read(self, message: JointState) -> Wheels | None:
+        """Torques of a command in the order of the wheels; None if one is missing or not finite."""
+        torque = cast(Wheels, m.select_by_name(m.read_torques(message), self._wheel_names))
+        if all(map(math.isfinite, torque)):
+            return torque
+        self.get_logger().warning(
+            f"a command without a finite torque for each of {', '.join(self._wheel_names)} was dropped",
+            throttle_duration_sec=1.0,
+        )
+        return None
 
     def _continue(self) -> bool:
         """Report progress; False, once, at the end of the cycle."""
