@@ -1,0 +1,124 @@
+"""Cycles: what is read, what is refused, and with which words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iwm_power_manager.cycle import load_cycle, make_cycle
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import sha256_of
+from iwm_power_manager.share import share_path
+
+
+@pytest.fixture
+def write(tmp_path):
+    def to_file(text, name="trip.csv"):
+        path = tmp_path / name
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return to_file
+
+
+@pytest.mark.parametrize(
+    ("name", "duration_s", "distance_km", "top_mps"),
+    [("ftp75", 1874, 17.769, 25.347), ("hwfet", 765, 16.507, 26.778), ("nycc", 598, 1.898, 12.383), ("udds", 1369, 11.990, 25.347)],
+)  # fmt: skip
+def test_the_shipped_cycles_have_the_published_length(name, duration_s, distance_km, top_mps):
+    cycle = load_cycle(share_path(f"config/cycles/{name}.csv"))
+    assert cycle.name == name
+    assert cycle.duration_s == duration_s
+    assert cycle.distance_m / 1000.0 == pytest.approx(distance_km, abs=0.001)
+    assert cycle.speed_mps.max() == pytest.approx(top_mps, abs=0.001)
+
+
+def test_columns_may_come_in_any_order_with_comments_gaps_and_uneven_steps(write):
+    path = write("# my trip\nspeed_mps, grade, time_s\n1,0.01,10\n\n3,0.02,12\n# gap\n2,-0.01,100.5\n")
+    cycle = load_cycle(path)
+    assert cycle.time_s.tolist() == [10.0, 12.0, 100.5]
+    assert cycle.speed_mps.tolist() == [1.0, 3.0, 2.0]
+    assert cycle.grade.tolist() == [0.01, 0.02, -0.01]
+    assert cycle.sha256 == sha256_of(path)
+    assert cycle.path == str(path)
+
+
+def test_windows_line_ends_and_a_byte_order_mark_are_read(write):
+    assert load_cycle(write(b"\xef\xbb\xbftime_s,speed_mps\r\n0,0\r\n1,1\r\n")).speed_mps.tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is empty"),
+        ("# nothing\n\n", "is empty"),
+        ("time_s,speed_mps\n", "has 0 row(s)"),
+        ("time_s,speed_mps\n0,1\n", "has 1 row(s)"),
+        ("0,1\n1,2\n", "column 'time_s' is missing"),
+        ("time_s\n0\n1\n", "line 1: column 'speed_mps' is missing"),
+        ("time_s,speed_mps,slope\n0,1,0\n1,1,0\n", "column 'slope' is unknown; allowed: time_s,speed_mps[,grade]"),
+        ("time_s,speed_mps,time_s\n0,1,0\n1,1,1\n", "column 'time_s' stands twice"),
+        ("time_s,speed_mps\n0,1\n1\n", "line 3: has 1 values; allowed: 2"),
+        ("time_s,speed_mps\n0,1\n1,fast\n", "line 3: speed_mps 'fast' is no number"),
+        ("time_s,speed_mps\n0,1\n1,nan\n", "line 3: speed_mps nan is not finite"),
+        ("time_s,speed_mps\n0,1\ninf,1\n", "line 3: time_s inf is not finite"),
+        ("time_s,speed_mps\n0,1\n1,-0.1\n", "line 3: speed_mps -0.1 is out of range; allowed: 0 to 70"),
+        ("time_s,speed_mps\n0,1\n1,71\n", "line 3: speed_mps 71 is out of range"),
+        ("time_s,speed_mps,grade\n0,1,0\n1,1,0.6\n", "line 3: grade 0.6 is out of range; allowed: -0.5 to 0.5"),
+        ("time_s,speed_mps\n# pause\n0,1\n2,1\n\n2,1\n", "line 6: time_s 2 does not increase; allowed: > 2 s"),
+        ("time_s,speed_mps\n5,1\n2,1\n", "line 3: time_s 2 does not increase"),
+        (b"time_s,speed_mps\n0,\xff\n", "is not UTF-8 text"),
+        ('time_s,speed_mps\n0,"1\n1,1\n', "line 2: is no CSV"),
+    ],
+)
+def test_a_bad_file_is_refused_with_its_line(write, text, words):
+    path = write(text)
+    with pytest.raises(ConfigError) as caught:
+        load_cycle(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert words in message
+    assert "\n" not in message
+
+
+def test_a_missing_file_is_a_clear_error(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        load_cycle(tmp_path / "none.csv")
+
+
+def test_arrays_are_checked_like_files():
+    cycle = make_cycle("made", [0, 1, 3], [0.0, 2.0, 2.0])
+    assert cycle.distance_m == pytest.approx(5.0)
+    assert make_cycle("made", [0, 1, 3], [0.0, 2.0, 2.0]).sha256 == cycle.sha256
+    assert make_cycle("made", [0, 1, 3], [0.0, 2.0, 2.1]).sha256 != cycle.sha256
+    with pytest.raises(ConfigError, match="sample 1: speed_mps -2 is out of range"):
+        make_cycle("made", [0, 1], [0.0, -2.0])
+    with pytest.raises(ConfigError, match="different lengths"):
+        make_cycle("made", [0, 1], [0.0, 1.0, 2.0])
+
+
+def test_resampling_is_linear_and_starts_at_zero():
+    cycle = make_cycle("made", [10.0, 11.0, 13.0], [0.0, 2.0, 0.0], [0.0, 0.1, 0.1]).resample(0.5)
+    assert cycle.time_s.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+    assert cycle.speed_mps.tolist() == [0.0, 1.0, 2.0, 1.5, 1.0, 0.5, 0.0]
+    assert cycle.grade.tolist() == pytest.approx([0.0, 0.05, 0.1, 0.1, 0.1, 0.1, 0.1])
+
+
+@given(st.integers(1, 400), st.sampled_from([0.01, 0.02, 0.05, 0.1, 0.25]))
+def test_resampling_loses_no_whole_step_to_rounding(steps, dt_s):
+    assert make_cycle("made", [0.0, steps * dt_s], [1.0, 1.0]).resample(dt_s).time_s.size == steps + 1
+
+
+@pytest.mark.parametrize("dt_s", [0.0, -0.1, np.nan, np.inf])
+def test_a_step_that_is_no_step_is_refused(dt_s):
+    with pytest.raises(ConfigError, match="dt_s"):
+        make_cycle("made", [0, 1], [0.0, 1.0]).resample(dt_s)
+
+
+def test_a_cycle_shorter_or_far_longer_than_the_step_is_refused():
+    with pytest.raises(ConfigError, match="shorter than a step"):
+        make_cycle("made", [0.0, 0.05], [0.0, 1.0]).resample(0.1)
+    with pytest.raises(ConfigError, match="too long for steps"):
+        make_cycle("made", [0.0, 1e9], [0.0, 1.0]).resample(0.1)

@@ -1,0 +1,142 @@
+"""Files: atomic writes, strict YAML, and checks that name file, key, value and range."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+
+import pytest
+
+from iwm_power_manager import files
+from iwm_power_manager.errors import ConfigError
+
+
+def test_a_write_replaces_the_file_and_leaves_nothing_else(tmp_path):
+    path = tmp_path / "data.bin"
+    path.write_bytes(b"old")
+    path.chmod(0o640)
+    files.atomic_write(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert os.listdir(tmp_path) == ["data.bin"]
+    assert files.sha256_of(path) == hashlib.sha256(b"new").hexdigest()
+
+
+def test_a_new_file_gets_what_the_umask_allows(tmp_path):
+    before = os.umask(0o027)
+    try:
+        files.atomic_write(tmp_path / "data.bin", b"x")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "data.bin").stat().st_mode & 0o777 == 0o640
+
+
+def test_a_write_that_fails_keeps_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "data.bin"
+    path.write_bytes(b"old")
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ConfigError, match=r"data\.bin: cannot be written: No space left"):
+        files.atomic_write(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["data.bin"]
+
+
+def test_a_symbolic_link_stays_a_link(tmp_path):
+    (tmp_path / "real.bin").write_bytes(b"old")
+    (tmp_path / "link.bin").symlink_to("real.bin")
+    files.atomic_write(tmp_path / "link.bin", b"new")
+    assert (tmp_path / "link.bin").is_symlink()
+    assert (tmp_path / "real.bin").read_bytes() == b"new"
+
+
+def test_a_missing_folder_is_a_clear_error(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be written: No such file"):
+        files.atomic_write(tmp_path / "none" / "data.bin", b"x")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        files.sha256_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("a: 1\nb: {c: 1, c: 2}\n", "line 2: key 'c' stands twice"),
+        ("a: 1\na: 1\n", "line 2: key 'a' stands twice"),
+        ("a: [1, 2\n", "expected ',' or ']'"),
+        ("\ta: 1\n", "line 1: found character"),
+        ("- 1\n", "holds no mapping"),
+        ("", "holds no mapping"),
+        ("1: 2\n", "1: is no text key"),
+        ("a: 2020-13-45\n", "is no YAML"),
+        ("a: !!python/object/apply:os.system [ls]\n", "could not determine a constructor"),
+    ],
+)
+def test_yaml_that_is_not_right_is_refused_in_one_line(tmp_path, text, words):
+    path = tmp_path / "settings.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        files.read_yaml(path)
+    assert words in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_numbers_are_read_as_yaml_1_2_writes_them(tmp_path):
+    path = tmp_path / "settings.yaml"
+    path.write_text("values: [1e-3, 2E4, -1e3, .5e1, 3, 0.5, 1.e+2]\n")
+    assert files.read_yaml(path)["values"] == [0.001, 20000.0, -1000.0, 5.0, 3, 0.5, 100.0]
+
+
+def test_keys_are_checked_against_what_is_known():
+    assert files.check_keys("f", {"a": 1}, ("a",), ("b",)) == {"a": 1}
+    with pytest.raises(ConfigError, match=r"^f: top\.c: is an unknown key; allowed: a, b$"):
+        files.check_keys("f", {"a": 1, "c": 2}, ("a",), ("b",), "top")
+    with pytest.raises(ConfigError, match="^f: a: is missing$"):
+        files.check_keys("f", {}, ("a",))
+    with pytest.raises(ConfigError, match=r"^f: top: 3 is no mapping; allowed: the keys a$"):
+        files.check_keys("f", 3, ("a",), parent="top")
+
+
+@pytest.mark.parametrize(
+    ("value", "options", "words"),
+    [
+        (True, {}, "True is no number; allowed: a finite number"),
+        ("1", {"unit": "m"}, "'1' is no number; allowed: a finite number m"),
+        (None, {}, "None is no number"),
+        (math.nan, {"low": 0}, "nan is not finite; allowed: >= 0"),
+        (math.inf, {"high": 3, "below": True}, "inf is not finite; allowed: < 3"),
+        (-1, {"low": 0, "high": 1, "unit": "m"}, "-1 is out of range; allowed: 0 to 1 m"),
+        (0, {"low": 0, "above": True}, "0 is out of range; allowed: > 0"),
+        (1, {"low": 0, "high": 1, "below": True}, "1 is out of range; allowed: 0 <= value < 1"),
+        (5, {"high": 3}, "5 is out of range; allowed: <= 3"),
+    ],
+)
+def test_a_number_out_of_its_range_is_refused_with_the_range(value, options, words):
+    with pytest.raises(ConfigError) as caught:
+        files.check_number("f", "k", value, **options)
+    assert str(caught.value) == f"f: k: {words}" or str(caught.value).startswith(f"f: k: {words}")
+
+
+def test_what_is_right_passes_every_check():
+    assert files.check_number("f", "k", 1, 0, 1) == 1.0
+    assert files.check_integer("f", "k", 3, 0, 5) == 3
+    assert files.check_choice("f", "k", "a", {"a": 1}) == "a"
+    assert files.check_bool("f", "k", False) is False
+    assert files.dotted("", "k") == "k"
+
+
+def test_integers_choices_and_switches_are_checked():
+    with pytest.raises(ConfigError, match=r"1\.5 is no integer; allowed: 0 to 5"):
+        files.check_integer("f", "k", 1.5, 0, 5)
+    with pytest.raises(ConfigError, match="9 is out of range; allowed: 0 to 5 s"):
+        files.check_integer("f", "k", 9, 0, 5, unit="s")
+    with pytest.raises(ConfigError, match="'c' is unknown; allowed: a | b"):
+        files.check_choice("f", "k", "c", ("a", "b"))
+    with pytest.raises(ConfigError, match=r"\['a'\] is unknown"):
+        files.check_choice("f", "k", ["a"], ("a", "b"))
+    with pytest.raises(ConfigError, match="'yes' is neither true nor false"):
+        files.check_bool("f", "k", "yes")
