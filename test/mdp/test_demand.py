@@ -1,0 +1,167 @@
+"""The demand's Markov chain: power of a cycle, counting, rows without data, mixing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iwm_power_manager.cycle import load_cycle, make_cycle
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.mdp.demand import (
+    THIN_ROW_STEPS,
+    Source,
+    count_steps,
+    cycle_power_w,
+    cycle_source,
+    demand_chain,
+    nearest_bin,
+    signal_source,
+)
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+
+CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+AXIS = np.array([-2000.0, -1000.0, 0.0, 1000.0, 2000.0])
+
+
+def _source(*sequences, weight=1.0):
+    return Source("test", "", weight, tuple(np.asarray(s, dtype=np.float64) for s in sequences))
+
+
+def _count_slowly(axis, sequence):
+    counts = np.zeros((axis.size, axis.size))
+    for now, then in zip(sequence, sequence[1:], strict=False):
+        counts[np.argmin(np.abs(axis - now)), np.argmin(np.abs(axis - then))] += 1
+    return counts
+
+
+@given(st.lists(st.floats(-4000, 4000), max_size=50))
+def test_every_step_is_counted_in_the_nearest_bins(values):
+    assert np.array_equal(count_steps(AXIS, np.array(values)), _count_slowly(AXIS, values))
+
+
+def test_halfway_between_two_bins_the_lower_one_counts_and_the_ends_take_the_rest():
+    assert nearest_bin(AXIS, np.array([-9000.0, -1500.0, -1499.0, 500.0, 9000.0])).tolist() == [0, 0, 1, 2, 4]
+    assert nearest_bin(np.array([5.0]), np.array([-1.0, 7.0])).tolist() == [0, 0]
+
+
+@given(st.integers(0, 10_000), st.integers(1, 12), st.integers(2, 60))
+def test_rows_are_distributions(seed, points, samples):
+    rng = np.random.default_rng(seed)
+    axis = np.sort(rng.choice(np.arange(-20, 20), points, replace=False)) * 1000.0
+    chain = demand_chain(axis, [_source(rng.normal(0.0, 8000.0, samples), weight=rng.uniform(0.1, 10.0))])
+    assert np.all(chain.probability >= 0.0)
+    assert chain.probability.sum(axis=1) == pytest.approx(np.ones(points), abs=1e-14)
+
+
+def test_a_counted_row_holds_the_relative_frequencies():
+    chain = demand_chain(AXIS, [_source([0, 0, 1000, 0, 0, -1000, 0])])
+    assert chain.probability[2].tolist() == [0.0, 0.25, 0.5, 0.25, 0.0]
+    assert chain.row_steps.tolist() == [0.0, 1.0, 4.0, 1.0, 0.0]
+
+
+def test_a_row_without_data_returns_bin_by_bin_to_the_nearest_demand_with_data():
+    chain = demand_chain(AXIS, [_source([-1000, -1000, 1000, -1000])])
+    assert chain.unvisited_w.tolist() == [-2000.0, 0.0, 2000.0]
+    assert chain.probability[0].tolist() == [0, 1, 0, 0, 0]
+    assert chain.probability[4].tolist() == [0, 0, 0, 1, 0]
+    # Two bins away on a longer axis: still one bin a step.
+    far = demand_chain(np.array([0.0, 1000.0, 2000.0, 3000.0]), [_source([0, 0])])
+    assert far.probability[3].tolist() == [0, 0, 1, 0]
+    assert far.probability[1].tolist() == [1, 0, 0, 0]
+
+
+def test_of_two_equally_near_demands_the_smaller_one_is_taken():
+    chain = demand_chain(np.array([-2000.0, -1000.0, 0.0]), [_source([-2000, 0, -2000])])
+    assert chain.probability[1].tolist() == [0, 0, 1]
+
+
+def test_the_last_demand_of_a_recording_was_visited_but_never_left():
+    chain = demand_chain(AXIS, [_source([0, 0, 2000])])
+    assert chain.row_steps[4] == 0.0
+    assert chain.probability[4].tolist() == [0, 0, 0, 1, 0]
+
+
+def test_no_step_leads_from_one_sequence_to_the_next():
+    apart = demand_chain(AXIS, [_source([0, 0], [2000, 2000])])
+    assert apart.probability[2].tolist() == [0, 0, 1, 0, 0]
+    assert demand_chain(AXIS, [_source([0, 0, 2000, 2000])]).probability[2, 4] == 0.5
+
+
+def test_weights_say_how_much_a_step_of_a_source_counts():
+    calm, wild = _source([0, 0]), _source([0, 1000], weight=3.0)
+    chain = demand_chain(AXIS, [calm, wild])
+    assert chain.probability[2].tolist() == [0, 0, 0.25, 0.75, 0]
+    assert chain.row_steps[2] == 4.0
+
+
+def test_thin_rows_and_clipped_demands_are_reported():
+    chain = demand_chain(AXIS, [_source([0.0] * (THIN_ROW_STEPS + 1) + [5000.0, 0.0])])
+    assert chain.thin_w.tolist() == [2000.0]
+    assert chain.clipped == pytest.approx(1.0 / (THIN_ROW_STEPS + 3))
+
+
+def test_sources_without_a_single_step_are_refused():
+    with pytest.raises(ConfigError, match="test: holds no step of power demand"):
+        demand_chain(AXIS, [_source([0.0])])
+    with pytest.raises(ConfigError, match="demand: holds no step"):
+        demand_chain(AXIS, [])
+
+
+def test_power_of_a_constant_speed_is_road_load_times_speed():
+    power = cycle_power_w(make_cycle("made", [0, 10], [20.0, 20.0]), 0.1, CAR)
+    assert power == pytest.approx(np.full(100, (0.5 * 1.2 * 1.66 * 0.34 * 400.0 + 0.01 * 800.0 * 9.81) * 20.0))
+
+
+def test_power_of_an_acceleration_moves_the_wheels_too():
+    power = cycle_power_w(make_cycle("made", [0, 10], [0.0, 20.0]), 0.1, CAR)
+    drag = 0.5 * 1.2 * 1.66 * 0.34
+    time = 0.1 * np.arange(100) + 0.05
+    force = (800.0 + 4.0 * 1.1 / 0.33**2) * 2.0 + drag * (2.0 * time) ** 2 + 0.01 * 800.0 * 9.81
+    assert power == pytest.approx(force * 2.0 * time)
+
+
+def test_a_grade_costs_its_weight_and_a_standing_car_nothing():
+    uphill = cycle_power_w(make_cycle("made", [0, 1], [10.0, 10.0], [0.1, 0.1]), 0.1, CAR)
+    level = cycle_power_w(make_cycle("made", [0, 1], [10.0, 10.0]), 0.1, CAR)
+    cosine = 1.0 / np.sqrt(1.01)
+    expected = 800.0 * 9.81 * 10.0 * (0.1 * cosine + 0.01 * (cosine - 1.0))
+    assert uphill - level == pytest.approx(np.full(10, expected))
+    assert np.all(cycle_power_w(make_cycle("made", [0, 1], [0.0, 0.0], [0.1, 0.1]), 0.1, CAR) == 0.0)
+
+
+def test_the_standard_cycles_visit_every_demand_of_the_paper_s_axis():
+    sources = [
+        cycle_source(load_cycle(share_path(f"config/cycles/{name}.csv")), 0.1, CAR) for name in ("ftp75", "hwfet", "nycc")
+    ]
+    chain = demand_chain(np.arange(-12, 20) * 1000.0, sources)
+    assert chain.unvisited_w.size == 0
+    assert chain.row_steps.sum() == sum(source.steps for source in sources) == 18740 + 7650 + 5980 - 3
+    assert 0.0 < chain.clipped < 0.01
+
+
+def test_a_recorded_signal_is_sampled_cut_at_gaps_and_cleaned():
+    time = np.array([0.0, 0.05, 0.1, 0.15, 0.2, np.nan, 0.12, 5.0, 5.1, 5.2, 9.0])
+    power = np.array([0.0, 50.0, 100.0, 150.0, 200.0, 1.0, 1e9, 7.0, np.inf, 9.0, 3.0])
+    source = signal_source("bag", time, power, 0.1, 2.0)
+    assert [s.tolist() for s in source.sequences] == [pytest.approx([0.0, 100.0, 200.0]), pytest.approx([7.0, 8.0, 9.0])]
+    assert source.steps == 4
+    assert source.weight == 2.0
+    assert signal_source("other", time, power, 0.1).sha256 == source.sha256
+    assert signal_source("bag", time, power + 1.0, 0.1).sha256 != source.sha256
+
+
+def test_an_empty_signal_is_a_source_without_steps():
+    assert signal_source("bag", np.array([]), np.array([]), 0.1).steps == 0
+
+
+def test_a_recording_of_a_cycle_gives_the_cycle_s_chain():
+    cycle = load_cycle(share_path("config/cycles/nycc.csv"))
+    power = cycle_power_w(cycle, 0.1, CAR)
+    recorded = signal_source("bag", 100.0 + 0.1 * np.arange(power.size), power, 0.1)
+    axis = np.arange(-12, 20) * 1000.0
+    from_bag = demand_chain(axis, [recorded])
+    from_cycle = demand_chain(axis, [cycle_source(cycle, 0.1, CAR)])
+    assert np.array_equal(from_bag.probability, from_cycle.probability)
