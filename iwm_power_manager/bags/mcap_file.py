@@ -160,12 +160,13 @@ class McapFile:
         self._metadata_indexes.append(_record(METADATA_INDEX, struct.pack("<QQ", offset, len(record)) + _text(name)))
 
     def write(self, channel: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes) -> None:
-        """Add a message to the chunk in memory."""
+        """Add a message to the chunk in memory; all numbers >= 0."""
         chunk = self._chunk
-        self._index[channel].extend((log_time_ns, len(chunk)))
-        chunk += _MESSAGE_HEAD.pack(
+        head = _MESSAGE_HEAD.pack(
             MESSAGE, _MESSAGE_FIELDS_BYTES + len(data), channel, sequence, log_time_ns, publish_time_ns
         )
+        self._index[channel].extend((log_time_ns, len(chunk)))
+        chunk += head
         chunk += data
         if len(chunk) >= self._chunk_bytes:
             self.flush()

@@ -208,14 +208,20 @@ class McapScan:
 
     def _read_summary(self, offset: int) -> None:
         """Schemas and channels repeated after the data: other writers announce them inside of chunks only."""
+        data = self._map
+        crc_offset = len(data) - len(MAGIC) - _U32.size
         try:
-            while offset + _RECORD_HEAD.size <= len(self._map):
-                opcode, length = _RECORD_HEAD.unpack_from(self._map, offset)
+            summary_start, _, crc = struct.unpack_from("<QQI", data, crc_offset - 2 * _U64.size)
+            if crc and zlib.crc32(data[summary_start:crc_offset]) != crc:
+                self.damage = self.damage or "its summary is damaged"
+                return
+            while offset + _RECORD_HEAD.size <= len(data):
+                opcode, length = _RECORD_HEAD.unpack_from(data, offset)
                 body = offset + _RECORD_HEAD.size
                 if opcode == FOOTER:
                     break
                 if opcode in (SCHEMA, CHANNEL):
-                    self._definition(opcode, self._map[body : body + length])
+                    self._definition(opcode, data[body : body + length])
                 offset = body + length
         except (struct.error, UnicodeDecodeError):
             self.damage = self.damage or "its summary is damaged"

@@ -226,17 +226,16 @@ class _SqliteSource:
         self.start_ns = self.end_ns = 0
         self._topics: dict[int, Topic] = {}
         try:
-            uri = f"{path.resolve().as_uri()}?mode=ro"
-            self._database = stack.enter_context(closing(sqlite3.connect(uri, uri=True)))
-            columns = {str(row[1]) for row in self._database.execute("PRAGMA table_info(topics)")}
-            hash_column = "type_description_hash" if "type_description_hash" in columns else "''"
-            definitions = self._definitions()
-            for number, name, msgtype, qos, type_hash in self._database.execute(
-                f"SELECT id, name, type, offered_qos_profiles, {hash_column} FROM topics"  # noqa: S608 - two constants
-            ):
-                self._topics[number] = Topic(
-                    name, msgtype, definitions.get(msgtype, ""), type_hash or "", parse_qos(qos or "")
-                )
+            self._database = stack.enter_context(
+                closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True))
+            )
+            try:
+                self._read_topics()
+            except sqlite3.DatabaseError:
+                # A truncated file is refused as a whole, unless one says that one knows.
+                self._database.execute("PRAGMA writable_schema = ON")
+                self._read_topics()
+                self.damage = "is truncated"
         except sqlite3.Error as error:
             raise BagError(f"{path}: is no readable sqlite3 bag: {error}") from None
         try:
@@ -244,6 +243,17 @@ class _SqliteSource:
             self.start_ns, self.end_ns = (row[0] or 0), (row[1] or 0)
         except sqlite3.Error as error:
             self.damage = str(error)
+
+    def _read_topics(self) -> None:
+        columns = {str(row[1]) for row in self._database.execute("PRAGMA table_info(topics)")}
+        hash_column = "type_description_hash" if "type_description_hash" in columns else "''"
+        definitions = self._definitions()
+        for number, name, msgtype, qos, type_hash in self._database.execute(
+            f"SELECT id, name, type, offered_qos_profiles, {hash_column} FROM topics"  # noqa: S608 - two constants
+        ):
+            self._topics[number] = Topic(
+                name, msgtype, definitions.get(msgtype, ""), type_hash or "", parse_qos(qos or "")
+            )
 
     def topics(self) -> list[Topic]:
         return list(self._topics.values())

@@ -73,7 +73,9 @@ _DISCOVERY_FAST_S = 0.05
 _DISCOVERY_SLOW_S = 0.5
 #: The publisher learns of the match a little after the subscription does.
 _SETTLE_S = 0.2
-_FINAL_WAIT_S = 0.5
+#: After the signal to end: taking goes on until nothing has come for the one, at most for the other.
+_FINAL_QUIET_S = 0.1
+_FINAL_WAIT_S = 2.0
 _CLOCK_FIELDS = struct.Struct("<iI")
 _CDR_HEAD_BYTES = 4
 
@@ -179,7 +181,10 @@ class Recorder(Node):
     def finish(self) -> None:
         """Take what still arrives, close the bag; `BagError` if recording had failed or fails now."""
         deadline = time.monotonic() + _FINAL_WAIT_S
-        while self._take() and time.monotonic() < deadline:
+        quiet_since = time.monotonic()
+        while (now := time.monotonic()) < min(deadline, quiet_since + _FINAL_QUIET_S):
+            if self._take():
+                quiet_since = now
             time.sleep(self._poll_s)
         if self._held:
             # No /clock ever came: all messages keep the time they were received.
@@ -212,10 +217,9 @@ class Recorder(Node):
                 raise AssertionError("topics are announced in the order they are found")
             if topic.name == CLOCK:
                 self._clock_topic = number
-            if self._remote_parameters is not None:
-                for publisher in topic.publishers:
-                    self._remote_parameters.ask(publisher)
         if self._remote_parameters is not None:
+            for publisher in self._raw.publishers:
+                self._remote_parameters.ask(publisher)
             answers = self._remote_parameters.answers()
             if answers:
                 self.recording.add_custom_data({f"parameters {name}": text for name, text in answers.items()})
@@ -249,7 +253,7 @@ class Recorder(Node):
             number, _, data, sent, sequence = taken
             if number == self._clock_topic and len(data) >= _CDR_HEAD_BYTES + _CLOCK_FIELDS.size:
                 seconds, nanoseconds = _CLOCK_FIELDS.unpack_from(data, _CDR_HEAD_BYTES)
-                self._now_ns = seconds * 1_000_000_000 + nanoseconds
+                self._now_ns = max(seconds * 1_000_000_000 + nanoseconds, 0)
             if self._now_ns is None:
                 self._held.append(taken)
                 continue

@@ -29,6 +29,9 @@ Taken = tuple[int, int, bytes, int, int]
 #: Messages taken from one topic before the next has its turn, so that a flood on one cannot starve the others.
 _TURN = 5000
 
+#: What the middleware says while it has not heard of a publisher's node.
+_UNKNOWN_NODE_NAME = "_NODE_NAME_UNKNOWN_"
+
 
 class _Unattended(CallbackGroup):
     """A group no executor ever serves."""
@@ -44,14 +47,13 @@ class _Unattended(CallbackGroup):
 
 
 class FoundTopic(NamedTuple):
-    """A topic that `RawSubscriptions` has just subscribed to; `publishers` are full node names."""
+    """A topic that `RawSubscriptions` has just subscribed to."""
 
     number: int
     name: str
     type: str
     type_hash: str
     offered: tuple[Qos, ...]
-    publishers: tuple[str, ...]
 
 
 class _Topic:
@@ -81,6 +83,10 @@ class RawSubscriptions:
     names : full topic names
     pattern : regular expression a full topic name has to match as a whole; None for none
     depth : messages each subscription keeps until they are taken
+
+    Attributes
+    ----------
+    publishers : full names of the nodes that publish these topics, as far as they are known
     """
 
     def __init__(
@@ -90,6 +96,7 @@ class RawSubscriptions:
         self._names = frozenset(names)
         self._pattern = pattern
         self._depth = depth
+        self.publishers: set[str] = set()
         self._group = _Unattended()
         self._topics: dict[str, _Topic] = {}
         self._refused: dict[str, str] = {}
@@ -104,6 +111,7 @@ class RawSubscriptions:
             publishers = self._node.get_publishers_info_by_topic(name)
             if not publishers:
                 continue
+            self.publishers |= _node_names(publishers)
             try:
                 topic = self._topics.get(name)
                 if topic is None:
@@ -228,8 +236,16 @@ def _found(topic: _Topic, msgtype: str, publishers: Sequence[TopicEndpointInfo])
         msgtype,
         known if known.startswith("RIHS01_") else "",
         tuple(dict.fromkeys(_offered(info.qos_profile) for info in publishers)),
-        tuple(dict.fromkeys(f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in publishers)),
     )
+
+
+def _node_names(publishers: Sequence[TopicEndpointInfo]) -> set[str]:
+    """Full node names; a node's name may arrive later than its publishers."""
+    return {
+        f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+        for info in publishers
+        if info.node_name != _UNKNOWN_NODE_NAME
+    }
 
 
 def _offered(profile: QoSProfile) -> Qos:

@@ -1,0 +1,134 @@
+"""The MCAP files against the independent reader of the `mcap` package."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+
+from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
+
+
+def fill(path: Path, count: int, **options: object) -> McapFile:
+    file = McapFile(path, library="test", **options)  # type: ignore[arg-type]
+    schema = file.schema_id("pkg/msg/A", "ros2msg", "float64 data")
+    channels = [file.add_channel(f"/t{i}", schema, {"key": "value"}) for i in range(3)]
+    for i in range(count):
+        file.write(channels[i % 3], 1000 + i, 900 + i, i, bytes([i % 256]) * (i % 50))
+    return file
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_a_finished_file_holds_every_message_with_valid_checksums_and_index(tmp_path: Path, compression: str) -> None:
+    file = fill(tmp_path / "a.mcap", 2000, compression=compression, chunk_bytes=4096)
+    file.add_metadata("extra", {"a": "1", "b": ""})
+    file.finish()
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        statistics = summary.statistics
+        assert statistics is not None
+        assert statistics.message_count == 2000
+        assert statistics.channel_message_counts == {1: 667, 2: 667, 3: 666}
+        assert (statistics.message_start_time, statistics.message_end_time) == (1000, 2999)
+        assert statistics.chunk_count == len(summary.chunk_indexes) > 5
+        for i, (schema, channel, message) in enumerate(reader.iter_messages()):
+            assert schema is not None
+            assert (schema.name, channel.topic, message.data) == (
+                "pkg/msg/A",
+                f"/t{i % 3}",
+                bytes([i % 256]) * (i % 50),
+            )
+            assert (message.log_time, message.publish_time, message.sequence) == (1000 + i, 900 + i, i)
+        # One topic in a span of time: found by the message index alone.
+        found = [m.log_time for _, _, m in reader.iter_messages(topics=["/t1"], starting_at=1500, ending_before=1510)]
+        assert found == [1502, 1505, 1508]
+        assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [("extra", {"a": "1", "b": ""})]
+
+
+def test_log_times_out_of_order_are_found_by_the_index(tmp_path: Path) -> None:
+    file = McapFile(tmp_path / "a.mcap", library="test")
+    channel = file.add_channel("/t", 0, {})
+    for time_ns in (5, 3, 9, 1, 7):
+        file.write(channel, time_ns, time_ns, 0, b"x")
+    file.finish()
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        assert [m.log_time for _, _, m in make_reader(stream).iter_messages()] == [1, 3, 5, 7, 9]
+
+
+def test_a_file_without_messages_is_valid(tmp_path: Path) -> None:
+    McapFile(tmp_path / "a.mcap", library="test").finish()
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        summary = make_reader(stream, validate_crcs=True).get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 0
+
+
+def test_everything_flushed_is_readable_from_the_unfinished_file(tmp_path: Path) -> None:
+    file = fill(tmp_path / "a.mcap", 500)
+    assert file.pending_count == 500
+    file.flush(sync=True)
+    assert (file.pending_count, file.pending_bytes, file.message_count) == (0, 0, 500)
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        count = 0
+        with pytest.raises(Exception, match=r".*"):  # mcap has several for a missing end
+            for record in StreamReader(stream).records:
+                count += type(record).__name__ == "Message"
+    assert count == 500
+    file.abandon()
+
+
+def test_an_existing_file_is_never_touched(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"precious")
+    with pytest.raises(FileExistsError):
+        McapFile(tmp_path / "a.mcap", library="test")
+    assert (tmp_path / "a.mcap").read_bytes() == b"precious"
+
+
+def test_a_half_written_chunk_is_cut_off_so_that_the_file_can_still_be_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = fill(tmp_path / "a.mcap", 100)
+    file.flush()
+    stream = file._stream
+
+    class FullDisk:
+        """Takes 100 bytes more, then none."""
+
+        def __init__(self) -> None:
+            self.room = 100
+
+        def write(self, data: memoryview) -> int:
+            if not self.room:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            written = stream.write(data[: self.room])
+            self.room -= written
+            return written
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(stream, name)
+
+    monkeypatch.setattr(file, "_stream", FullDisk())
+    for i in range(100):
+        file.write(1, 5000 + i, 0, 0, bytes(range(100)))
+    with pytest.raises(OSError, match="No space left"):
+        file.flush()
+    monkeypatch.setattr(file, "_stream", stream)
+    assert file.message_count == 100
+    file.finish()
+    with (tmp_path / "a.mcap").open("rb") as readable:
+        assert sum(1 for _ in make_reader(readable, validate_crcs=True).iter_messages()) == 100
+
+
+def test_a_file_removed_while_it_is_written_is_noticed_at_the_next_flush(tmp_path: Path) -> None:
+    file = fill(tmp_path / "a.mcap", 10)
+    (tmp_path / "a.mcap").unlink()
+    with pytest.raises(FileNotFoundError, match="removed"):
+        file.flush()
+    file.abandon()

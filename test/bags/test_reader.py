@@ -1,0 +1,214 @@
+"""Reading what this project, rosbags and mcap have written, whole or damaged."""
+
+from __future__ import annotations
+
+import random
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from bags_helpers import FLOAT64, float64, topic
+from iwm_power_manager.bags.definitions import typestore
+from iwm_power_manager.bags.reader import BagReader, parse_qos
+from iwm_power_manager.bags.writer import BagWriter, WriterOptions
+from iwm_power_manager.errors import BagError
+
+
+def written_by_rosbags(
+    path: Path, storage: StoragePlugin, mode: CompressionMode = CompressionMode.NONE, version: int = 9
+) -> Path:
+    writer = Writer(path, version=version, storage_plugin=storage)  # type: ignore[arg-type]
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    writer.set_custom_data("key", "value")
+    with writer:
+        connection = writer.add_connection("/a", FLOAT64, typestore=typestore())
+        for i in range(100):
+            writer.write(connection, 1000 + i, float64(i))
+    return path
+
+
+def contents(path: Path) -> list[tuple[int, str, bytes]]:
+    with BagReader(path) as reader:
+        found = [(m.log_time_ns, m.topic, m.data) for m in reader.messages()]
+        assert reader.damage == []
+    return found
+
+
+EXPECTED = [(1000 + i, "/a", float64(i)) for i in range(100)]
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize("mode", list(CompressionMode))
+@pytest.mark.parametrize("version", [8, 9])
+def test_bags_of_rosbags_in_either_storage_and_every_compression(
+    tmp_path: Path, storage: StoragePlugin, mode: CompressionMode, version: int
+) -> None:
+    if storage is StoragePlugin.SQLITE3 and mode is CompressionMode.STORAGE:
+        pytest.skip("sqlite3 has no compression of its own")
+    path = written_by_rosbags(tmp_path / "bag", storage, mode, version)
+    assert contents(path) == EXPECTED
+    with BagReader(path) as reader:
+        assert reader.topics["/a"].type == FLOAT64
+        assert reader.custom_data == {"key": "value"}
+        assert (reader.start_ns, reader.end_ns) == (1000, 1099)
+        assert reader.counts == {"/a": 100}
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_single_file_of_the_mcap_package_chunked_or_not(
+    tmp_path: Path, compression: CompressionType, chunked: bool
+) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, compression=compression, use_chunking=chunked, chunk_size=500)
+        writer.start("ros2")
+        schema = writer.register_schema(FLOAT64, "ros2msg", b"float64 data")
+        channel = writer.register_channel("/a", "cdr", schema)
+        for i in range(100):
+            writer.add_message(channel, 1000 + i, float64(i), 1000 + i)
+        writer.finish()
+    assert contents(path) == EXPECTED
+
+
+def test_many_files_read_as_one_in_the_order_of_log_times(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag", WriterOptions(chunk_bytes=1024)) as bag:
+        number = bag.add_topic(topic("/a"))
+        for part in range(12):
+            for i in range(50):
+                bag.write(number, part * 50 + i, float64(i))
+            bag.split()
+    assert [entry[0] for entry in contents(tmp_path / "bag")] == list(range(600))
+    (tmp_path / "bag" / "metadata.yaml").unlink()  # the order then comes from the names: 9 before 10
+    with BagReader(tmp_path / "bag") as reader:
+        assert [m.log_time_ns for m in reader.messages()] == list(range(600))
+        assert reader.damage == [f"{tmp_path / 'bag'}: has no metadata.yaml: the recorder did not finish"]
+
+
+def test_overlapping_chunks_and_files_are_merged_by_log_time(tmp_path: Path) -> None:
+    times = list(range(2000))
+    random.Random(1).shuffle(times)
+    with BagWriter(tmp_path / "bag", WriterOptions(chunk_bytes=1024)) as bag:
+        number = bag.add_topic(topic("/a"))
+        for i, time_ns in enumerate(times):
+            bag.write(number, time_ns, float64(time_ns))
+            if i == 1000:
+                bag.split()
+    assert [entry[0] for entry in contents(tmp_path / "bag")] == list(range(2000))
+
+
+def test_equal_log_times_keep_the_order_of_the_recording(make_bag: Callable[..., Path]) -> None:
+    path = make_bag([("/a", 5, float(i)) for i in range(300)], chunk_bytes=1024)
+    assert [entry[2] for entry in contents(path)] == [float64(i) for i in range(300)]
+
+
+def test_a_missing_file_of_a_bag_is_reported_and_the_others_read(make_bag: Callable[..., Path]) -> None:
+    path = make_bag([("/a", i * 100, float(i)) for i in range(30)], max_duration_ns=1000)
+    (path / "bag_1.mcap").unlink()
+    with BagReader(path) as reader:
+        assert [m.log_time_ns for m in reader.messages()] == [*range(0, 1000, 100), *range(2000, 3000, 100)]
+        assert reader.damage == [f"{path / 'bag_1.mcap'}: is missing"]
+
+
+def test_a_file_that_is_no_bag_is_reported_and_the_others_read(make_bag: Callable[..., Path]) -> None:
+    path = make_bag([("/a", i * 100, float(i)) for i in range(20)], max_duration_ns=1000)
+    (path / "bag_1.mcap").write_bytes(b"")
+    with BagReader(path) as reader:
+        assert sum(1 for _ in reader.messages()) == 10
+        assert reader.damage == [f"{path / 'bag_1.mcap'}: is empty"]
+
+
+def test_a_truncated_sqlite_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "bag"
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
+    with writer:
+        connection = writer.add_connection("/a", FLOAT64, typestore=typestore())
+        for i in range(20_000):
+            writer.write(connection, 1000 + i, float64(i))
+    database = path / "bag.db3"
+    database.write_bytes(database.read_bytes()[: database.stat().st_size // 2])
+    with BagReader(path) as reader:
+        found = [m.log_time_ns for m in reader.messages()]
+        assert found == list(range(1000, 1000 + len(found)))
+        assert len(found) > 1000
+        assert "malformed" in reader.damage[0]
+
+
+def test_a_sqlite_bag_older_than_type_hashes_and_definitions(tmp_path: Path) -> None:
+    path = tmp_path / "old.db3"
+    database = sqlite3.connect(path)
+    database.execute("CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT, "
+                     "offered_qos_profiles TEXT)")  # fmt: skip
+    database.execute("CREATE TABLE messages(id INTEGER, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+    database.execute("INSERT INTO topics VALUES(1, '/a', ?, 'cdr', '')", (FLOAT64,))
+    database.executemany("INSERT INTO messages VALUES(?, 1, ?, ?)", [(i, 1000 + i, float64(i)) for i in range(100)])
+    database.commit()
+    database.close()
+    assert contents(path) == EXPECTED
+
+
+def test_a_truncated_compressed_file_is_read_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "bag"
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/a", FLOAT64, typestore=typestore())
+        for i in range(5000):
+            writer.write(connection, 1000 + i, random.Random(i).randbytes(1000))
+    (packed,) = path.glob("*.zstd")
+    packed.write_bytes(packed.read_bytes()[:-2_000_000])
+    with BagReader(path) as reader:
+        found = [m.log_time_ns for m in reader.messages()]
+        assert found == list(range(1000, 1000 + len(found)))
+        assert len(found) > 1000
+        assert reader.damage
+
+
+def test_metadata_that_cannot_be_read_is_reported_and_the_files_read(make_bag: Callable[..., Path]) -> None:
+    path = make_bag([("/a", 1, 1.0)])
+    (path / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
+    with BagReader(path) as reader:
+        assert sum(1 for _ in reader.messages()) == 1
+        assert reader.damage == [f"{path / 'metadata.yaml'}: cannot be read"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "line"),
+    [
+        ("missing", "bag: does not exist"),
+        ("empty", r"bag: holds no \.mcap or \.db3 file"),
+        ("text", "bag: is no MCAP file"),
+        ("database", r"bag\.db3: is no readable sqlite3 bag"),
+    ],
+)
+def test_what_is_no_bag_gets_one_clear_line(tmp_path: Path, kind: str, line: str) -> None:
+    path = tmp_path / ("bag.db3" if kind == "database" else "bag")
+    if kind == "empty":
+        path.mkdir()
+    elif kind in ("text", "database"):
+        path.write_text("this is a text, and not a short one either")
+    with pytest.raises(BagError, match=line):
+        BagReader(path)
+
+
+def test_an_undecodable_compressed_message_becomes_an_empty_one(tmp_path: Path) -> None:
+    path = written_by_rosbags(tmp_path / "bag", StoragePlugin.MCAP)
+    information = yaml.safe_load((path / "metadata.yaml").read_text())
+    information["rosbag2_bagfile_information"].update(compression_mode="MESSAGE", compression_format="zstd")
+    (path / "metadata.yaml").write_text(yaml.safe_dump(information))
+    assert [data for _, _, data in contents(path)] == [b""] * 100
+
+
+def test_qos_of_every_rosbag2_version_is_understood() -> None:
+    numbers = "- history: 1\n  depth: 5\n  reliability: 2\n  durability: 1\n  deadline: {sec: 0, nsec: 7}\n"
+    numbers += "  lifespan: {sec: 1, nsec: 0}\n  liveliness: 1\n  liveliness_lease_duration: {sec: 0, nsec: 0}\n"
+    (profile,) = parse_qos(numbers)
+    assert (profile.history, profile.reliability, profile.durability) == ("keep_last", "best_effort", "transient_local")
+    assert (profile.depth, profile.deadline_ns, profile.lifespan_ns) == (5, 7, 1_000_000_000)
+    assert parse_qos("") == parse_qos("nonsense") == parse_qos("[1, 2]") == parse_qos("{") == ()

@@ -1,0 +1,442 @@
+"""The recorder as a process of its own, over real DDS."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TwistStamped
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.highlevel import AnyReader
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64, String
+from std_srvs.srv import Trigger
+
+from iwm_power_manager.bags.reader import BagReader, Message
+from iwm_power_manager.bags.recover import recover
+
+PATIENCE_S = 30.0
+LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+RELIABLE = QoSProfile(depth=1000)
+
+
+class RecorderProcess:
+    """A recorder started like a user would, its output kept."""
+
+    def __init__(self, output: Path, *parameters: str, remaps: tuple[str, ...] = ()) -> None:
+        arguments = [f"-p {name}" for name in (f"output:={output}", *parameters)] + [f"-r {remap}" for remap in remaps]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "iwm_power_manager.nodes.recorder", "--ros-args", *" ".join(arguments).split()],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def end(self, number: signal.Signals = signal.SIGINT) -> tuple[int, str]:
+        """Signal it and wait; returns its exit code and what it said on standard error."""
+        if self.process.poll() is None:
+            self.process.send_signal(number)
+        _, error = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, error
+
+
+class Peer:
+    """A node in this process that publishes and listens."""
+
+    def __init__(self) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = Node("peer", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        """Spin until a condition holds."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not condition():
+            if time.monotonic() > deadline:
+                pytest.fail(f"{what}: did not happen within {PATIENCE_S:g} s")
+            self.executor.spin_once(timeout_sec=0.05)
+
+    def until_ready(self, namespace: str = "") -> None:
+        """Spin until the recorder says that it is ready."""
+        heard: list[bool] = []
+        listener = self.node.create_subscription(
+            Bool, f"{namespace}/recorder/ready", lambda message: heard.append(message.data), LATCHED
+        )
+        self.until(lambda: bool(heard) and heard[-1], "recorder ready")
+        self.node.destroy_subscription(listener)
+
+    def call(self, service: str) -> Trigger.Response:
+        """Call one of the recorder's services."""
+        client = self.node.create_client(Trigger, f"/recorder/{service}")
+        self.until(client.service_is_ready, f"service {service}")
+        future = client.call_async(Trigger.Request())
+        self.until(future.done, f"answer of {service}")
+        self.node.destroy_client(client)
+        return future.result()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    created = Peer()
+    yield created
+    created.close()
+
+
+@pytest.fixture
+def recorder() -> Iterator[Callable[..., RecorderProcess]]:
+    started: list[RecorderProcess] = []
+
+    def start(output: Path, *parameters: str, remaps: tuple[str, ...] = ()) -> RecorderProcess:
+        started.append(RecorderProcess(output, *parameters, remaps=remaps))
+        return started[-1]
+
+    yield start
+    for process in started:
+        process.process.kill()
+        process.process.communicate()
+
+
+def recorded(path: Path) -> dict[str, list[Message]]:
+    """Messages by topic; the bag has to be whole."""
+    found: dict[str, list[Message]] = {}
+    with BagReader(path) as reader:
+        for message in reader.messages():
+            found.setdefault(message.topic, []).append(message)
+        assert reader.damage == []
+    return found
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_every_message_is_recorded_byte_by_byte_and_a_signal_ends_it_cleanly(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess], number: signal.Signals
+) -> None:
+    process = recorder(tmp_path / "bag", "wait_for:=[/numbers,/joints]", "topics:=[/numbers]", "regex:=/joi.*")
+    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    joints = peer.node.create_publisher(JointState, "/joints", RELIABLE)
+    peer.until_ready()
+    sent_numbers = [Float64(data=float(i)) for i in range(1000)]
+    sent_joints = [JointState(name=["a", "b"], velocity=[float(i), 0.5]) for i in range(200)]
+    for i, message in enumerate(sent_numbers):
+        numbers.publish(message)
+        if i % 5 == 0:
+            joints.publish(sent_joints[i // 5])
+    assert numbers.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+    assert joints.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+    code, error = process.end(number)
+    assert code == 0, error
+    assert "dropped 0, lost on the way 0" in error
+    found = recorded(tmp_path / "bag")
+    assert [m.data for m in found["/numbers"]] == [serialize_message(m) for m in sent_numbers]
+    assert [deserialize_message(m.data, JointState) for m in found["/joints"]] == sent_joints
+    assert [m.sequence for m in found["/numbers"]] == list(range(1, 1001))
+    for message in found["/numbers"]:
+        assert 0 <= message.log_time_ns - message.publish_time_ns < 10e9
+    with AnyReader([tmp_path / "bag"]) as reader:  # independent: schemas, index, counts
+        assert {c.topic: c.msgcount for c in reader.connections} == {"/numbers": 1000, "/joints": 200}
+        last = [reader.deserialize(d, c.msgtype) for c, _, d in reader.messages() if c.topic == "/joints"][-1]
+        assert list(last.velocity) == [199.0, 0.5]
+
+
+def test_default_topics_honour_namespace_and_remaps_and_metadata_tells_files_and_parameters(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    vehicle = tmp_path / "vehicle.yaml"
+    vehicle.write_text("name: car\n")
+    peer.node.declare_parameter("mass_kg", 812.5)
+    speed = peer.node.create_publisher(TwistStamped, "/car/vehicle_speed", 10)
+    demand = peer.node.create_publisher(Float64, "/other/demand", 10)
+    process = recorder(
+        tmp_path / "bag",
+        "wait_for:=[vehicle_speed,power_demand]",
+        f"vehicle_file:={vehicle}",
+        "metadata:=['run=7']",
+        remaps=("__ns:=/car", "power_demand:=/other/demand"),
+    )
+    peer.until_ready("/car")
+    speed.publish(TwistStamped())
+    demand.publish(Float64(data=1.0))
+
+    def parameters_are_there() -> bool:
+        with BagReader(tmp_path / "bag") as reader:
+            return "parameters /peer" in reader.custom_data
+
+    peer.until(parameters_are_there, "parameters of the publisher")
+    code, error = process.end()
+    assert code == 0, error
+    found = recorded(tmp_path / "bag")
+    assert (
+        {"/car/vehicle_speed", "/other/demand", "/diagnostics"} >= set(found) >= {"/car/vehicle_speed", "/other/demand"}
+    )
+    with BagReader(tmp_path / "bag") as reader:
+        assert json.loads(reader.custom_data["parameters /peer"])["mass_kg"] == 812.5
+        assert reader.custom_data["run"] == "7"
+        assert reader.custom_data["vehicle_file"] == "vehicle.yaml"
+        assert len(reader.custom_data["vehicle_sha256"]) == 64
+
+
+def test_latched_and_best_effort_publishers_are_met_with_their_own_qos(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    latched = peer.node.create_publisher(String, "/latched", LATCHED)
+    latched.publish(String(data="before the recorder"))
+    best_effort = peer.node.create_publisher(
+        Float64, "/best_effort", QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
+    process = recorder(tmp_path / "bag", "regex:=/(latched|best_effort)", "wait_for:=[/latched,/best_effort]")
+    peer.until_ready()
+    best_effort.publish(Float64(data=2.0))
+    # A volatile, best-effort newcomer cannot meet what was asked of the first: the recorder asks for less.
+    newcomer = peer.node.create_publisher(
+        String, "/latched", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
+    peer.until(lambda: newcomer.get_subscription_count() == 1, "match with the newcomer")
+    newcomer.publish(String(data="newcomer"))
+
+    def newcomer_is_there() -> bool:
+        with BagReader(tmp_path / "bag") as reader:
+            return any(b"newcomer" in message.data for message in reader.messages())
+
+    peer.until(newcomer_is_there, "message of the newcomer on disk")
+    assert process.end()[0] == 0
+    found = recorded(tmp_path / "bag")
+    assert [m.data for m in found["/best_effort"]] == [serialize_message(Float64(data=2.0))]
+    texts = [m.data[8:].rstrip(b"\0").decode() for m in found["/latched"]]
+    assert texts[0] == "before the recorder"
+    assert texts[-1] == "newcomer"
+    with BagReader(tmp_path / "bag") as reader:
+        assert reader.topics["/latched"].qos[0].durability == "transient_local"
+        assert reader.topics["/best_effort"].qos[0].reliability == "best_effort"
+
+
+def test_services_start_split_stop_and_take_snapshots(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    process = recorder(
+        tmp_path / "bag", "topics:=[/numbers]", "wait_for:=[/numbers]", "record:=false", "snapshot_s:=100.0"
+    )
+    peer.until_ready()
+    numbers.publish(Float64(data=0.0))
+    assert not peer.call("stop").success
+    started = peer.call("start")
+    assert (started.success, started.message) == (True, str(tmp_path / "bag"))
+    again = peer.call("start")
+    assert not again.success
+    assert "is being recorded already" in again.message
+
+    def publish_and_see(value: float, path: Path) -> None:
+        numbers.publish(Float64(data=value))
+        peer.until(
+            lambda: any(m.data == serialize_message(Float64(data=value)) for m in partly(path)), f"{value} on disk"
+        )
+
+    def partly(path: Path) -> list[Message]:
+        with BagReader(path) as reader:
+            return list(reader.messages())
+
+    publish_and_see(1.0, tmp_path / "bag")
+    assert peer.call("split").success
+    publish_and_see(2.0, tmp_path / "bag")
+    snapshot = peer.call("snapshot")
+    assert snapshot.success
+    assert peer.call("stop").message == str(tmp_path / "bag")
+    numbers.publish(Float64(data=3.0))
+    assert peer.call("start").message == str(tmp_path / "bag_1")
+    publish_and_see(4.0, tmp_path / "bag_1")
+    assert process.end()[0] == 0
+
+    def values(path: str | Path) -> list[float]:
+        with AnyReader([Path(path)]) as reader:
+            return [reader.deserialize(data, c.msgtype).data for c, _, data in reader.messages()]
+
+    assert [value for value in values(tmp_path / "bag") if value] == [1.0, 2.0]
+    assert len(list((tmp_path / "bag").glob("*.mcap"))) == 2
+    assert values(snapshot.message) == [0.0, 1.0, 2.0]
+    assert values(tmp_path / "bag_1")[-1] == 4.0
+
+
+def test_simulated_time_is_the_log_time_and_nothing_before_the_clock_is_lost(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    clock = peer.node.create_publisher(Clock, "/clock", RELIABLE)
+    process = recorder(
+        tmp_path / "bag", "use_sim_time:=true", "topics:=[/numbers,/clock]", "wait_for:=[/numbers,/clock]"
+    )
+    peer.until_ready()
+    numbers.publish(Float64(data=-1.0))
+    for i in range(50):
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = 100 + i // 10, i % 10 * 100_000_000
+        clock.publish(message)
+        numbers.publish(Float64(data=float(i)))
+    assert numbers.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+    assert process.end()[0] == 0
+    found = recorded(tmp_path / "bag")
+    times = [m.log_time_ns for m in found["/numbers"]]
+    assert times == [100_000_000_000, *(100_000_000_000 + i * 100_000_000 for i in range(50))]
+    assert len(found["/clock"]) == 50
+
+
+def test_without_any_clock_simulated_time_falls_back_to_the_time_of_reception(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    process = recorder(tmp_path / "bag", "use_sim_time:=true", "topics:=[/numbers]", "wait_for:=[/numbers]")
+    peer.until_ready()
+    numbers.publish(Float64(data=1.0))
+    assert numbers.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+    assert process.end()[0] == 0
+    (message,) = recorded(tmp_path / "bag")["/numbers"]
+    assert 0 <= message.log_time_ns - message.publish_time_ns < 10e9
+
+
+def test_diagnostics_report_counts_and_losses(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    reports: list[DiagnosticArray] = []
+    peer.node.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 10)
+    process = recorder(tmp_path / "bag", "topics:=[/numbers]", "wait_for:=[/numbers]", "max_message_bytes:=11")
+    peer.until_ready()
+    for _ in range(7):
+        numbers.publish(Float64(data=1.0))
+
+    def latest() -> dict[str, str]:
+        return {entry.key: entry.value for entry in reports[-1].status[0].values} if reports else {}
+
+    peer.until(lambda: latest().get("dropped_size") == "7", "report of seven messages over the limit")
+    status = reports[-1].status[0]
+    assert status.level == b"\x01"
+    assert status.name == "recorder: recording"
+    assert latest()["/numbers"] == "7 taken, 0 lost, 0 before the first"
+    assert (latest()["state"], latest()["ready"], latest()["written"]) == ("recording", "True", "0")
+    assert process.end()[0] == 0
+
+
+def test_a_failing_disk_ends_the_node_with_one_line(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    process = recorder(tmp_path / "bag", "topics:=[/numbers]", "wait_for:=[/numbers]", "flush_period_s:=0.05")
+    peer.until_ready()
+    (tmp_path / "bag" / "bag_0.mcap").unlink()
+    (tmp_path / "bag").rmdir()
+
+    def ended() -> bool:
+        numbers.publish(Float64(data=1.0))
+        return process.process.poll() is not None
+
+    peer.until(ended, "end of the recorder")
+    code, error = process.end()
+    assert code == 1
+    last = error.strip().splitlines()[-1]
+    assert last.startswith(f"recorder: {tmp_path / 'bag'}: cannot be written: the file was removed")
+    assert "Traceback" not in error
+
+
+@pytest.mark.parametrize(
+    ("parameter", "line"),
+    [
+        ("compression:=gzip", "parameter compression: 'gzip' is not allowed; allowed: none | lz4 | zstd"),
+        ("flush_period_s:=100.0", "parameter flush_period_s: 100.0 is not allowed"),
+        ("regex:=(", "parameter regex: '(' is no regular expression"),
+        ("policy_file:=/no/policy.npz", "/no/policy.npz: cannot be read: No such file or directory"),
+        ("metadata:=[a]", "parameter metadata: 'a' is not allowed; allowed: key=value"),
+        ("output:=/proc/none/bag", "/proc/none/bag: cannot be created: No such file or directory"),
+        ("output:={existing}", "exists already and is not overwritten"),
+    ],
+)
+def test_a_wrong_parameter_gets_one_line_and_exit_code_1(
+    tmp_path: Path, recorder: Callable[..., RecorderProcess], parameter: str, line: str
+) -> None:
+    process = recorder(tmp_path / "bag", parameter.replace("{existing}", str(tmp_path)))
+    process.process.wait(PATIENCE_S)
+    code, error = process.end()
+    assert code == 1
+    assert line in error
+    assert len(error.strip().splitlines()) == 1
+    assert error.startswith("recorder: ")
+
+
+def test_the_recover_command_needs_no_ros_and_says_what_was_lost(tmp_path: Path) -> None:
+    from bags_helpers import float64, topic
+    from iwm_power_manager.bags.writer import BagWriter
+
+    bag = BagWriter(tmp_path / "bag")
+    number = bag.add_topic(topic("/a"))
+    bag.write(number, 5, float64(1.0))
+    bag.flush()
+    bag.abandon()
+    command = [sys.executable, "-m", "iwm_power_manager.nodes.recorder", "--recover", str(tmp_path / "bag")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, "ROS_DOMAIN_ID": "x"})
+    assert "rebuilt with 1 messages" in done.stdout
+    assert "metadata.yaml written" in done.stdout
+    done = subprocess.run([*command, str(tmp_path / "none")], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == f"recorder: {tmp_path / 'none'}: does not exist\n"
+
+
+def kill_while_publishing(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess], run: int, delay_s: float
+) -> None:
+    """Kill the node at 1 kHz after `delay_s`, recover, compare with what was sent."""
+    path = tmp_path / f"bag{run}"
+    process = recorder(path, "topics:=[/numbers]", "wait_for:=[/numbers]")
+    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    peer.until_ready()
+    first_ns = time.time_ns()
+    killer = threading.Timer(delay_s, process.process.kill)
+    killer.start()
+    count = 0
+    while process.process.poll() is None:
+        numbers.publish(Float64(data=float(count)))
+        count += 1
+        time.sleep(max(0.0, (first_ns + count * 1_000_000 - time.time_ns()) * 1e-9))
+    killed_ns = time.time_ns()
+    peer.node.destroy_publisher(numbers)
+    report = recover(path)
+    if report.files[0].message_count == 0:
+        assert delay_s < 1.0
+        return
+    with BagReader(path) as reader:
+        sequences = [m.sequence for m in reader.messages()]
+        assert reader.damage == []
+    assert sequences == list(range(1, len(sequences) + 1))
+    assert killed_ns - report.end_ns < 1_000_000_000
+
+
+def test_killed_at_1_khz_the_node_loses_less_than_its_last_second(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    kill_while_publishing(tmp_path, peer, recorder, 0, 1.3)
+
+
+@pytest.mark.nightly
+def test_killed_fifty_times_at_1_khz_the_node_loses_less_than_its_last_second(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    for run in range(50):
+        kill_while_publishing(tmp_path, peer, recorder, run, 0.05 + 0.05 * run)
