@@ -25,8 +25,13 @@ def write(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "duration_s", "distance_km", "top_mps"),
-    [("ftp75", 1874, 17.769, 25.347), ("hwfet", 765, 16.507, 26.778), ("nycc", 598, 1.898, 12.383), ("udds", 1369, 11.990, 25.347)],
-)  # fmt: skip
+    [
+        ("ftp75", 1874, 17.769, 25.347),
+        ("hwfet", 765, 16.507, 26.778),
+        ("nycc", 598, 1.898, 12.383),
+        ("udds", 1369, 11.990, 25.347),
+    ],
+)
 def test_the_shipped_cycles_have_the_published_length(name, duration_s, distance_km, top_mps):
     cycle = load_cycle(share_path(f"config/cycles/{name}.csv"))
     assert cycle.name == name

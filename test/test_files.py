@@ -95,7 +95,7 @@ def test_keys_are_checked_against_what_is_known():
     assert files.check_keys("f", {"a": 1}, ("a",), ("b",)) == {"a": 1}
     with pytest.raises(ConfigError, match=r"^f: top\.c: is an unknown key; allowed: a, b$"):
         files.check_keys("f", {"a": 1, "c": 2}, ("a",), ("b",), "top")
-    with pytest.raises(ConfigError, match="^f: a: is missing$"):
+    with pytest.raises(ConfigError, match=r"^f: a: is missing$"):
         files.check_keys("f", {}, ("a",))
     with pytest.raises(ConfigError, match=r"^f: top: 3 is no mapping; allowed: the keys a$"):
         files.check_keys("f", 3, ("a",), parent="top")
@@ -134,7 +134,7 @@ def test_integers_choices_and_switches_are_checked():
         files.check_integer("f", "k", 1.5, 0, 5)
     with pytest.raises(ConfigError, match="9 is out of range; allowed: 0 to 5 s"):
         files.check_integer("f", "k", 9, 0, 5, unit="s")
-    with pytest.raises(ConfigError, match="'c' is unknown; allowed: a | b"):
+    with pytest.raises(ConfigError, match=r"'c' is unknown; allowed: a \| b"):
         files.check_choice("f", "k", "c", ("a", "b"))
     with pytest.raises(ConfigError, match=r"\['a'\] is unknown"):
         files.check_choice("f", "k", ["a"], ("a", "b"))

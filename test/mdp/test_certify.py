@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from oracles.dense_mdp import dense, pack, policy_iteration, random_raw
 
 from iwm_power_manager.mdp.certify import bellman_bound, simulated_cost
 from iwm_power_manager.mdp.policy_iteration import solve
+from oracles.dense_mdp import dense, pack, policy_iteration, random_raw
 
 
 def _problem(tracked=True, discount=0.9):
@@ -28,7 +28,7 @@ def test_the_bellman_residual_bounds_the_error_of_any_cost_to_go():
 
 def test_driving_the_policy_costs_what_the_cost_to_go_says():
     for tracked in (False, True):
-        raw, model = _problem(tracked)
+        _, model = _problem(tracked)
         solution = solve(model, np.linspace(0.0, 1.0, 3), 1e-6)
         for state in ((0, 0, 0), (3, model.state_shape[1] - 1, 17), (1, 0, 8)):
             mean, error = simulated_cost(model, solution.policy, state, steps=200, runs=4000, seed=1)
@@ -37,7 +37,7 @@ def test_driving_the_policy_costs_what_the_cost_to_go_says():
 
 
 def test_driving_notices_a_policy_that_is_not_the_one_that_was_evaluated():
-    raw, model = _problem()
+    _, model = _problem()
     solution = solve(model, np.linspace(0.0, 1.0, 3), 1e-6)
     worse = np.where(solution.policy >= 0, 0, solution.policy).astype(np.int16)
     mean, error = simulated_cost(model, worse, (0, 1, 0), steps=200, runs=4000)

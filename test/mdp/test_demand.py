@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -32,7 +34,7 @@ def _source(*sequences, weight=1.0):
 
 def _count_slowly(axis, sequence):
     counts = np.zeros((axis.size, axis.size))
-    for now, then in zip(sequence, sequence[1:], strict=False):
+    for now, then in itertools.pairwise(sequence):
         counts[np.argmin(np.abs(axis - now)), np.argmin(np.abs(axis - then))] += 1
     return counts
 
@@ -134,7 +136,8 @@ def test_a_grade_costs_its_weight_and_a_standing_car_nothing():
 
 def test_the_standard_cycles_visit_every_demand_of_the_paper_s_axis():
     sources = [
-        cycle_source(load_cycle(share_path(f"config/cycles/{name}.csv")), 0.1, CAR) for name in ("ftp75", "hwfet", "nycc")
+        cycle_source(load_cycle(share_path(f"config/cycles/{name}.csv")), 0.1, CAR)
+        for name in ("ftp75", "hwfet", "nycc")
     ]
     chain = demand_chain(np.arange(-12, 20) * 1000.0, sources)
     assert chain.unvisited_w.size == 0
@@ -146,7 +149,10 @@ def test_a_recorded_signal_is_sampled_cut_at_gaps_and_cleaned():
     time = np.array([0.0, 0.05, 0.1, 0.15, 0.2, np.nan, 0.12, 5.0, 5.1, 5.2, 9.0])
     power = np.array([0.0, 50.0, 100.0, 150.0, 200.0, 1.0, 1e9, 7.0, np.inf, 9.0, 3.0])
     source = signal_source("bag", time, power, 0.1, 2.0)
-    assert [s.tolist() for s in source.sequences] == [pytest.approx([0.0, 100.0, 200.0]), pytest.approx([7.0, 8.0, 9.0])]
+    assert [s.tolist() for s in source.sequences] == [
+        pytest.approx([0.0, 100.0, 200.0]),
+        pytest.approx([7.0, 8.0, 9.0]),
+    ]
     assert source.steps == 4
     assert source.weight == 2.0
     assert signal_source("other", time, power, 0.1).sha256 == source.sha256

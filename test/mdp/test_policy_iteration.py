@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles.dense_mdp import dense, pack, policy_iteration, random_raw
 
 from iwm_power_manager.mdp import policy_iteration as solver
 from iwm_power_manager.mdp.policy_iteration import GATED, TIE_J, certified_bound, dot, solve
+from oracles.dense_mdp import dense, pack, policy_iteration, random_raw
 
 
 def _share(controls):

@@ -62,7 +62,14 @@ def test_mirrored_axes_may_leave_out_zero():
 
 
 def test_every_axis_may_have_a_single_point():
-    content = {**read_yaml(PAPER), "power_w": [0], "speed_mps": [10], "slip_front": [0], "slip_rear": [0], "share": [0.5]}
+    content = {
+        **read_yaml(PAPER),
+        "power_w": [0],
+        "speed_mps": [10],
+        "slip_front": [0],
+        "slip_rear": [0],
+        "share": [0.5],
+    }
     assert problem_from(content, "g.yaml").shape == (1, 1, 1, 1, 1)
 
 

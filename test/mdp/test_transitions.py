@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles import step as oracle
 
 from iwm_power_manager.mdp.problem import ERROR_NORMS, load_problem
 from iwm_power_manager.mdp.transitions import (
@@ -24,6 +23,7 @@ from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
 from iwm_power_manager.model.tyre import slip_ratio
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
+from oracles import step as oracle
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), "drag")
 PAPER = load_problem(share_path("config/grids/paper.yaml"))
@@ -38,7 +38,9 @@ def _params(problem=FINE, friction=0.9, **changes):
 @pytest.mark.parametrize("power_error", ["wheel", "road"])
 def test_a_step_solves_the_equations_of_the_paper(idle_drive, power_error):
     vehicle = load_vehicle(CAR.path, idle_drive).params
-    cases = itertools.product((-6000.0, -500.0, 800.0, 7000.0), (6.0, 20.0), (0.0, 0.5, 0.8), ((0.0, 0.0), (0.01, -0.02)))
+    cases = itertools.product(
+        (-6000.0, -500.0, 800.0, 7000.0), (6.0, 20.0), (0.0, 0.5, 0.8), ((0.0, 0.0), (0.01, -0.02))
+    )
     params = _params(power_error=power_error, error_norm="absolute", skid_avoidance="none")
     for power, speed, share, slips in cases:
         ours = step_cost_and_next(power, speed, *slips, share, vehicle, params)
@@ -127,7 +129,9 @@ def test_table_2_decides_which_axles_are_gated(skid, power, slips, gated):
 
 def test_a_gated_axle_gets_nothing_and_the_share_does_not_matter():
     params = _params(skid_avoidance="braking")
-    locked_front = [step_cost_and_next(-4000.0, 15.0, -0.35, 0.0, share, CAR.params, params) for share in (0.0, 0.4, 1.0)]
+    locked_front = [
+        step_cost_and_next(-4000.0, 15.0, -0.35, 0.0, share, CAR.params, params) for share in (0.0, 0.4, 1.0)
+    ]
     assert locked_front[0] == locked_front[1] == locked_front[2]
     # The freed wheel spins up again within the step; the other axle brakes alone.
     assert locked_front[0].slip_front > -0.02
@@ -158,7 +162,9 @@ def test_a_state_s_wheel_speed_has_the_state_s_slip(speed, slip):
     slip_model=st.sampled_from(["dynamic", "quasi_steady"]),
 )
 def test_every_step_is_finite_and_possible(power, speed, front, rear, share, friction, slip_model):
-    outcome = step_cost_and_next(power, speed, front, rear, share, CAR.params, _params(FINE, friction, slip_model=slip_model))
+    outcome = step_cost_and_next(
+        power, speed, front, rear, share, CAR.params, _params(FINE, friction, slip_model=slip_model)
+    )
     assert np.all(np.isfinite(outcome))
     assert outcome.speed_mps >= 0.0
     assert -1.0 <= outcome.slip_front <= 1.0
@@ -252,6 +258,8 @@ def test_gated_states_hold_the_one_step_that_table_2_leaves():
 
 def test_where_no_control_is_feasible_those_that_deliver_most_are_left():
     # 19 kW at 2 m/s is beyond every split: equal split delivers most.
-    problem = _tiny(power_w=np.array([19000.0]), speed_mps=np.array([2.0]), slip_front=np.zeros(1), slip_rear=np.zeros(1))
+    problem = _tiny(
+        power_w=np.array([19000.0]), speed_mps=np.array([2.0]), slip_front=np.zeros(1), slip_rear=np.zeros(1)
+    )
     model = build_model(problem, CAR.params, 0.9, np.eye(1))
     assert np.array_equal(np.isfinite(model.free_cost), [False, True, False])

@@ -48,9 +48,7 @@ def random_raw(rng, powers, cell_shape, controls, tracked, discount, gated=0.3, 
     if tracked:
         level = np.linspace(0.0, 1.0, controls)
         switching = 0.5 * scale * np.abs(level[:, None] - level[None, :])
-    return Raw(
-        discount, demand, cell_shape, switching, cost, corner, fraction, rng.random((powers, cells)) < gated
-    )
+    return Raw(discount, demand, cell_shape, switching, cost, corner, fraction, rng.random((powers, cells)) < gated)
 
 
 def pack(raw: Raw) -> Model:

@@ -57,9 +57,9 @@ def dynamic_step(power, speed, slips, share, vehicle, problem):
         torques.append(torque)
         motors.append(max(torque, -regeneration))
     drags = [
-        motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * w if m == 0.0 and motor.idle_drive == 1 else 0.0
+        (motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * w) * (m == 0.0 and motor.idle_drive == 1)
         for m, w in zip(motors, before, strict=True)
-    ]  # fmt: skip
+    ]
 
     def forces(v, w):
         acceleration = (v - speed) / dt

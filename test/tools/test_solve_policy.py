@@ -1,0 +1,244 @@
+"""`solve_policy` as a user calls it: files in, policies out, one line and a code for every mistake."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from iwm_power_manager.bags.signals import RecordedDrive
+from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.mdp.demand import cycle_power_w
+from iwm_power_manager.policy import load_policy, load_policy_bank, policy_bytes
+from iwm_power_manager.share import share_path
+from iwm_power_manager.tools import solve_policy
+from iwm_power_manager.vehicle import load_vehicle
+
+GRID = """\
+format: 1
+power_w: {from: -12000, to: 18000, step: 3000}
+speed_mps: [0, 5, 10, 25]
+slip_front: [-0.35, -0.01, 0, 0.01]
+slip_rear: [-0.35, -0.01, 0, 0.01]
+share: [0, 0.5, 1]
+previous_share: true
+dt_s: 0.1
+discount: 0.9
+alpha: 2.0
+switching_cost_j: 20
+"""
+
+
+@pytest.fixture
+def grid(tmp_path):
+    path = tmp_path / "coarse.yaml"
+    path.write_text(GRID)
+    return str(path)
+
+
+def _run(*arguments):
+    return solve_policy.main([str(argument) for argument in arguments])
+
+
+def _solve(grid, *arguments, vehicle="jalalmaab_2015", cycle="nycc"):
+    return _run("--vehicle", vehicle, "--cycle", cycle, "--grid", grid, *arguments)
+
+
+def test_it_writes_one_verified_policy_for_each_road(grid, tmp_path, capsys):
+    output = tmp_path / "new" / "policies"
+    report = tmp_path / "run.json"
+    assert _solve(grid, "--friction", 0.9, 0.2, "--output", output, "--idle-drive", "none", "--json", report) == 0
+    bank = load_policy_bank(output)
+    assert [policy.friction for policy in bank] == [0.2, 0.9]
+    assert all(policy.converged and policy.bound_j <= policy.problem.tolerance_j for policy in bank)
+    assert bank[0].idle_drive == "none"
+    assert bank[0].problem.name == "coarse"
+    assert {path.name for path in output.iterdir()} == {
+        "jalalmaab_2015_none_coarse_mu020.npz", "jalalmaab_2015_none_coarse_mu090.npz",
+    }  # fmt: skip
+    text = capsys.readouterr().out
+    for policy in bank:
+        assert f"friction {policy.friction:g}\n" in text
+        assert policy.checksum[:12] in text
+        for iteration in policy.iterations:
+            assert f"{iteration.bound_j:.3e}" in text
+    numbers = json.loads(report.read_text())
+    assert [p["checksum"] for p in numbers["policies"]] == [bank[1].checksum, bank[0].checksum]
+    assert np.sum(numbers["demand"]["row_steps"]) == 5979.0
+
+
+def test_the_same_inputs_give_the_same_bytes(grid, tmp_path):
+    for name in ("a.npz", "b.npz"):
+        assert _solve(grid, "--friction", 0.5, "--output", tmp_path / name, "--quiet") == 0
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_quiet_prints_nothing_when_all_is_well(grid, tmp_path, capsys):
+    assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "a.npz", "--quiet", cycle="ftp75") == 0
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "error" not in captured.err
+
+
+def test_options_replace_what_the_files_say(grid, tmp_path):
+    assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "a.npz", "--discount", 0.5, "--quiet") == 0
+    assert load_policy(tmp_path / "a.npz").problem.discount == 0.5
+
+
+def test_a_policy_that_misses_its_bound_is_written_and_reported(tmp_path, capsys):
+    path = tmp_path / "hasty.yaml"
+    path.write_text(GRID + "max_iterations: 1\n")
+    assert _solve(path, "--friction", 0.5, "--output", tmp_path / "a.npz") == 1
+    assert "NOT within the tolerance" in capsys.readouterr().out
+    assert not load_policy(tmp_path / "a.npz").converged
+
+
+def test_a_picture_shows_matrix_convergence_and_policies(grid, tmp_path):
+    picture = tmp_path / "solution.png"
+    assert _solve(grid, "--friction", 0.9, 0.2, "--output", tmp_path / "p", "--plot", picture, "--quiet") == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_check_accepts_what_was_solved_and_nothing_else(grid, tmp_path, capsys):
+    path = tmp_path / "a.npz"
+    assert _solve(grid, "--friction", 0.5, "--output", path, "--quiet") == 0
+    assert _run("--vehicle", "jalalmaab_2015", "--check", path) == 0
+    assert f"{path}: ok; friction 0.5" in capsys.readouterr().out
+    assert _run("--vehicle", "jalalmaab_2015", "--idle-drive", "enabled", "--check", path) == 2
+    assert "was solved for" in capsys.readouterr().err
+
+
+def test_check_notices_a_cost_to_go_that_is_not_the_problem_s(grid, tmp_path, capsys):
+    import dataclasses
+
+    path = tmp_path / "a.npz"
+    assert _solve(grid, "--friction", 0.5, "--output", path, "--quiet") == 0
+    policy = load_policy(path)
+    policy.cost_j[0, 0, 0, 0, 0] += 5.0
+    path.write_bytes(policy_bytes(dataclasses.replace(policy)))
+    assert _run("--vehicle", "jalalmaab_2015", "--check", path, "--quiet") == 1
+    assert "does NOT keep its bound" in capsys.readouterr().out
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    """A bag that holds the demand of NYCC, every 10 ms."""
+    car = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+    power = np.repeat(cycle_power_w(load_cycle(share_path("config/cycles/nycc.csv")), 0.1, car), 10)
+    drive = RecordedDrive(0.01 * np.arange(power.size), power, np.zeros(power.size), 3, ["file 2 ends early"])
+    monkeypatch.setattr(solve_policy, "read_signal", lambda bag, mapping, vehicle: drive)
+    return drive
+
+
+def test_a_bag_teaches_the_demand_instead_of_a_cycle(grid, tmp_path, recorded, capsys):
+    path = tmp_path / "a.npz"
+    options = ("--vehicle", "jalalmaab_2015", "--grid", grid, "--friction", 0.5, "--output", path)
+    assert _run(*options, "--bag", "drives/monday") == 0
+    captured = capsys.readouterr()
+    assert "demand from monday (598 s x 1)" in captured.out
+    assert "file 2 ends early" in captured.err
+    assert "3 bad messages" in captured.err
+    from_bag = load_policy(path)
+    assert _solve(grid, "--friction", 0.5, "--output", path, "--quiet") == 0
+    from_cycle = load_policy(path)
+    assert from_bag.chain.probability == pytest.approx(from_cycle.chain.probability, abs=0.01)
+
+
+def test_a_bag_mixes_with_cycles_by_weight(grid, tmp_path, recorded):
+    path = tmp_path / "a.npz"
+    assert (
+        _solve(grid, "--friction", 0.5, "--output", path, "--quiet", "--bag", "x", "--bag-weight", 10, cycle="hwfet")
+        == 0
+    )
+    policy = load_policy(path)
+    assert [(source["name"], source["weight"]) for source in policy.sources] == [("hwfet", 1.0), ("x", 10.0)]
+    assert policy.chain.row_steps.sum() == pytest.approx(7649.0 + 10.0 * 5979.0, abs=20.0)
+
+
+def test_thin_and_missing_data_is_warned_about(tmp_path, grid, capsys):
+    calm = tmp_path / "calm.csv"
+    calm.write_text("time_s,speed_mps\n0,10\n60,10\n65,14\n")
+    assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "a.npz", "--quiet", cycle=calm) == 0
+    warnings = capsys.readouterr().err
+    assert "no data at -12, -9, -6, -3, 3, 6, 15, 18 kW" in warnings
+    assert "less than 10 s of data at 9, 12 kW" in warnings
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--cycle", "nycc", "--output", "x"], "--friction: is missing"),
+        (["--cycle", "nycc", "--friction", "0.5"], "--output: is missing"),
+        (["--friction", "0.5", "--output", "x"], "--cycle: is missing"),
+        (
+            ["--cycle", "nycc", "--friction", "0", "--output", "x"],
+            "--friction: 0.0 is out of range; allowed: 0.01 to 2",
+        ),
+        (["--cycle", "nycc", "--friction", "nan", "--output", "x"], "--friction: nan is not finite"),
+        (["--cycle", "nycc", "--friction", "0.5", "0.5", "--output", "x"], "--friction: names a value twice"),
+        (
+            ["--cycle", "nycc", "--friction", "0.5", "0.9", "--output", "x.npz"],
+            "--output: x.npz is one file for 2 policies",
+        ),
+        (["--cycle", "nycc", "--friction", "0.5", "--output", "none/x.npz"], "none/x.npz: cannot be written"),
+        (["--cycle", "nycc", "--friction", "0.5", "--output", "file"], "--output: file: File exists"),
+        (
+            ["--cycle", "nycc", "--friction", "0.5", "--output", "x", "--discount", "1"],
+            "--discount: 1.0 is out of range",
+        ),
+        (
+            ["--cycle", "nycc", "--friction", "0.5", "--output", "x", "--bag-weight", "0"],
+            "--bag-weight: 0.0 is out of range",
+        ),
+        (["--cycle", "no_cycle.csv", "--friction", "0.5", "--output", "x"], "no_cycle.csv: cannot be read"),
+        (["--cycle", "nycc", "--friction", "0.5", "--output", "x", "--grid", "coarser"], "coarser: cannot be read"),
+        (["--bag", "no_bag", "--friction", "0.5", "--output", "x"], "no_bag"),
+        (["--check", "no_policy.npz"], "no_policy.npz: cannot be read"),
+    ],
+)
+def test_a_mistake_gives_one_line_and_code_2(arguments, words, grid, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    if "--grid" not in arguments:
+        arguments = ["--grid", grid, *arguments]
+    assert _run("--vehicle", "jalalmaab_2015", *arguments) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("solve_policy: error: ")
+    assert words in error
+
+
+def test_a_bad_vehicle_or_grid_is_named(grid, tmp_path, capsys):
+    assert _solve(grid, "--friction", 0.5, "--output", tmp_path, vehicle="no_car.yaml") == 2
+    assert "no_car.yaml: cannot be read" in capsys.readouterr().err
+    bad = tmp_path / "bad.yaml"
+    bad.write_text(GRID.replace("discount: 0.9", "discount: 1.1"))
+    assert _solve(bad, "--friction", 0.5, "--output", tmp_path) == 2
+    assert f"{bad}: discount: 1.1 is out of range; allowed: 0 to 0.9999" in capsys.readouterr().err
+
+
+def test_an_interrupt_ends_it_without_a_traceback(grid, tmp_path, monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(solve_policy, "build_model", interrupted)
+    assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "a.npz", "--quiet") == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert not (tmp_path / "a.npz").exists()
+
+
+def test_as_a_process_it_teaches_and_exits_with_its_codes(tmp_path):
+    def call(*arguments):
+        command = [sys.executable, "-m", "iwm_power_manager.tools.solve_policy", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+
+    taught = call("--help")
+    assert taught.returncode == 0
+    assert "examples:" in taught.stdout
+    assert "exit codes:" in taught.stdout
+    missing = call("--vehicle", "none.yaml", "--cycle", "nycc", "--friction", "0.5", "--output", "x")
+    assert missing.returncode == 2
+    assert missing.stderr == "solve_policy: error: none.yaml: cannot be read: No such file or directory\n"
+    assert call("--cycle", "nycc").returncode == 2
