@@ -134,6 +134,7 @@ def run(
     dt_s: float = 0.01,
     substeps: int = 1,
     soc: float = 0.8,
+    until_s: float = np.inf,
     noise: Noise = NO_NOISE,
     plant_vehicle: Vehicle | None = None,
 ) -> Run:
@@ -149,12 +150,15 @@ def run(
     dt_s : control step
     substeps : plant steps in a control step
     soc : state of charge at the start
+    until_s : drive only so much of the cycle
     noise : errors of the sensors
     plant_vehicle : the car as it is, if it differs
     """
     params = vehicle.params
     truth = params if plant_vehicle is None else plant_vehicle.params
     trace = sample(cycle, dt_s, params.driver.preview_s)
+    if until_s < np.inf:
+        trace = Trace(*(values[: int(np.floor(until_s / dt_s + 1e-9))] for values in trace))
     series = np.empty((trace.speed_mps.size, len(COLUMNS)))
     start = plant.initial_plant(truth, soc, float(trace.speed_mps[0]))
     told = friction if assumed_friction is None else assumed_friction

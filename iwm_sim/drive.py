@@ -7,8 +7,10 @@ takes what it commands. The same kernels on the same numbers in the same order g
 from __future__ import annotations
 
 import io
+import json
 import math
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -227,8 +229,8 @@ class Drive:
         self.car, self._foot, self._pedals, self.step = state, foot, None, 0
 
 
-def save_run(path: Path | str, run: Run) -> None:
-    """Write a run as .npz, atomically; `ConfigError` if the folder cannot be written."""
+def save_run(path: Path | str, run: Run, notes: Mapping[str, Any] | None = None) -> None:
+    """Write a run as .npz, atomically, with notes that JSON can hold; `ConfigError` if the folder cannot be written."""
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -236,18 +238,20 @@ def save_run(path: Path | str, run: Run) -> None:
         dt_s=np.float64(run.dt_s),
         series=run.series,
         final=np.array(_leaves(run.final)),
+        notes=np.array(json.dumps(dict(notes or {}))),
     )
     atomic_write(path, buffer.getvalue())
 
 
-def load_run(path: Path | str) -> Run:
-    """Read what `save_run` wrote; `ConfigError` if the file is something else."""
+def load_run(path: Path | str) -> tuple[Run, dict[str, Any]]:
+    """Read the run and the notes that `save_run` wrote; `ConfigError` if the file is something else."""
     try:
         with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as content:
             if tuple(content["columns"]) != COLUMNS:
                 raise ConfigError(path, "columns", "are those of another version", ", ".join(COLUMNS))
             leaves = iter(content["final"].tolist())
-            return Run(float(content["dt_s"]), content["series"], _rebuild(plant.PlantState, leaves))
+            run = Run(float(content["dt_s"]), content["series"], _rebuild(plant.PlantState, leaves))
+            return run, json.loads(str(content["notes"]))
     except (zipfile.BadZipFile, EOFError, KeyError, TypeError, ValueError, StopIteration):
         raise ConfigError(path, "", "is no recorded run") from None
 

@@ -12,8 +12,9 @@ import gc
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import rclpy
 from rclpy.clock import Clock, ClockType
@@ -158,6 +159,7 @@ class Simulator(Node):
             topic: self.create_publisher(m.TOPIC_TYPES[topic], topic, profile, event_callbacks=silent)
             for topic in (*topics, *optional)
         }
+        self._published = Counter[str]()
         self._listeners = dict.fromkeys(topics, 1)
         if values["wait_for_recorder"]:
             self._listeners = {topic: self._listeners.get(topic, 0) + 1 for topic in self._outputs}
@@ -317,26 +319,31 @@ class Simulator(Node):
         """Everything the car shows of itself at this step; `power_demand` closes the set."""
         stamp_ns = self._stamp_ns
         sensors = self._drive.sense()
-        output = self._outputs
         if self._simulated_time:
-            output[m.CLOCK].publish(m.clock_message(stamp_ns))
+            self._publish(m.CLOCK, m.clock_message(stamp_ns))
         if self._drive.step % self._pedal_steps == 0:
-            output[m.ACCELERATOR_PEDAL].publish(m.number_message(sensors.accelerator))
-            output[m.BRAKE_PEDAL].publish(m.number_message(sensors.brake))
-        output[m.VEHICLE_SPEED].publish(m.vehicle_speed_message(stamp_ns, sensors.speed_mps))
-        output[m.WHEEL_STATES].publish(
-            m.wheel_states_message(stamp_ns, self._wheel_names, sensors.wheel_speed_radps, sensors.motor_torque_nm)
+            self._publish(m.ACCELERATOR_PEDAL, m.number_message(sensors.accelerator))
+            self._publish(m.BRAKE_PEDAL, m.number_message(sensors.brake))
+        self._publish(m.VEHICLE_SPEED, m.vehicle_speed_message(stamp_ns, sensors.speed_mps))
+        self._publish(
+            m.WHEEL_STATES,
+            m.wheel_states_message(stamp_ns, self._wheel_names, sensors.wheel_speed_radps, sensors.motor_torque_nm),
         )
-        output[m.BATTERY_STATE].publish(
+        self._publish(
+            m.BATTERY_STATE,
             m.battery_state_message(
                 stamp_ns,
                 soc=sensors.soc,
                 voltage_v=sensors.battery_voltage_v,
                 discharge_current_a=sensors.battery_current_a,
                 capacity_ah=self._drive.capacity_ah,
-            )
+            ),
         )
-        output[m.POWER_DEMAND].publish(m.number_message(sensors.power_demand_w))
+        self._publish(m.POWER_DEMAND, m.number_message(sensors.power_demand_w))
+
+    def _publish(self, topic: str, message: Any) -> None:
+        self._outputs[topic].publish(message)
+        self._published[topic] += 1
 
     def _read(self, message: JointState) -> Wheels | None:
         """Torques of a command in the order of the wheels; None if one is missing or not finite."""
@@ -374,7 +381,7 @@ class Simulator(Node):
         )
         try:
             if self._result_file:
-                save_run(self._result_file, self._drive.run())
+                save_run(self._result_file, self._drive.run(), self._notes(lasted_s))
         except IwmError as error:
             self._fail(error)
             return
@@ -384,6 +391,18 @@ class Simulator(Node):
             left_s = max(deadline - time.monotonic(), 0.0)
             publisher.wait_for_all_acked(Duration(nanoseconds=int(left_s * 1e9)))
         self.done.set_result(None)
+
+    def _notes(self, lasted_s: float) -> dict[str, Any]:
+        """What happened around the drive, for the result file."""
+        return {
+            "first_stamp_ns": self._first_stamp_ns,
+            "period_ns": self._period_ns,
+            "wall_s": lasted_s,
+            "published": dict(self._published),
+            "resent": self._exchange.resent,
+            "command_timeouts": self._timeouts,
+            "stalls": self._pacer.stalls,
+        }
 
     def _fail(self, error: IwmError) -> None:
         self._phase = _Phase.DONE

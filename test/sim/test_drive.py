@@ -108,8 +108,9 @@ def test_a_car_without_commands_stops_by_its_brakes_alone(vehicle):
 
 def test_a_run_comes_back_from_its_file_as_it_was(tmp_path, driven):
     run = driven.run()
-    save_run(tmp_path / "run.npz", run)
-    again = load_run(tmp_path / "run.npz")
+    save_run(tmp_path / "run.npz", run, {"resent": 2})
+    again, notes = load_run(tmp_path / "run.npz")
+    assert notes == {"resent": 2}
     np.testing.assert_array_equal(again.series, run.series)
     assert again.final == run.final
     assert again.dt_s == run.dt_s

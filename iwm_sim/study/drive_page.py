@@ -1,0 +1,211 @@
+"""The page of one drive: result beside a reference, everything over time, settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iwm_power_manager.control.types import GATE_NAMES
+from iwm_sim.closed_loop import Run
+from iwm_sim.metrics import MOVING_MPS, Metrics
+from iwm_sim.study.report import Block, Chart, Column, Page, Panel, Series, Settings, Table, Text, Tile, Tiles
+from iwm_sim.study.report import format_value as shown
+
+BLUE, VERMILION, GREEN, PURPLE, OCHRE, SKY, GREY, BLACK = range(8)
+
+COLUMNS = (
+    Column("strategy", "Strategy"),
+    Column("made", "Run"),
+    Column("distance_km", "Distance", "km", 3),
+    Column("wh_per_km", "Energy", "Wh/km", 2, best="low"),
+    Column("delta_soc_percent", "ΔSoC", "%", 3, best="low"),
+    Column("saving_percent", "Saving", "%", 2),
+    Column("rms_speed_error_mps", "RMS speed error", "m/s", 3),
+    Column("min_slip", "Lowest slip", "", 3),
+    Column("max_slip", "Highest slip", "", 3),
+    Column("share_changes_per_min", "Front share changes", "1/min", 1),
+    Column("trace_held", "Trace"),
+)
+
+
+class Driven(NamedTuple):
+    """A run with what it amounts to.
+
+    Attributes
+    ----------
+    strategy : its name
+    made : how the run was made
+    run, metrics : the numbers
+    """
+
+    strategy: str
+    made: str
+    run: Run
+    metrics: Metrics
+
+
+def row(driven: Driven, reference: Driven) -> dict[str, Any]:
+    """A row of `COLUMNS`, and of the JSON result: metrics, with the saving against the reference.
+
+    Energies are compared only between runs that covered the same distance to 0.1 %; otherwise the saving is None.
+    """
+    metrics = driven.metrics
+    other = reference.metrics
+    saving = None
+    if driven is not reference and abs(metrics.distance_m - other.distance_m) <= 1e-3 * other.distance_m:
+        saving = 100.0 * (1.0 - metrics.energy_wh / other.energy_wh)
+    values = metrics._asdict() | {"distance_km": metrics.distance_m / 1000.0}
+    if np.isnan(driven.run["decided_share"]).all():
+        values["share_changes_per_min"] = None
+    return {"strategy": driven.strategy, "made": driven.made, "saving_percent": saving, **values}
+
+
+def drive_page(
+    driven: Driven,
+    reference: Driven,
+    *,
+    cycle: str,
+    critical_slip: float,
+    settings: Mapping[str, Any],
+    remarks: Sequence[str],
+) -> Page:
+    """The page of a drive.
+
+    Parameters
+    ----------
+    driven, reference : the drive shown and the one it is compared with
+    cycle : name of the cycle
+    critical_slip : drawn beside the slips
+    settings : what the runs were made with
+    remarks : sentences below the table
+    """
+    rows = [row(driven, reference), row(reference, reference)]
+    metrics = driven.metrics
+    saving = rows[0]["saving_percent"]
+    if driven.strategy == reference.strategy:
+        lead = f"{metrics.distance_m / 1000:.2f} km with equal distribution between the axles."
+    elif saving is None:
+        lead = f"{driven.strategy} and {reference.strategy} did not cover the same distance: compare Wh/km only."
+    else:
+        word = "less" if saving >= 0.0 else "more"
+        lead = (
+            f"{driven.strategy} took {abs(saving):.2f} % {word} energy than {reference.strategy} distribution over the "
+            f"same {metrics.distance_m / 1000:.2f} km."
+        )
+    held = "the car kept within 2 mph of the cycle's speed, inside 1 s (EPA tolerance)"
+    lost = f"the car left the EPA tolerance by up to {metrics.trace_excess_mps:.2f} m/s: its energy may not be compared"
+    blocks: list[Block] = [
+        Tiles(_tiles(rows[0], rows[1])),
+        Table("Result", COLUMNS, rows, note=" ".join(remarks)),
+        Chart("The drive", driven.run["time_s"], _panels(driven, reference, critical_slip)),
+        Text(
+            "Powers are those of the commands at the wheels, braking negative. Slip is the wheel's, drawn above "
+            f"{MOVING_MPS:g} m/s. A gate holds an axle at zero torque while its slip is beyond the critical one. "
+            "Energy saved is the reference's battery energy up to the same time, less this run's.",
+            "How to read it",
+        ),
+        Settings("Settings", settings),
+    ]
+    return Page(f"{driven.strategy} on {cycle}", lead, blocks, metrics.trace_held, held if metrics.trace_held else lost)
+
+
+def _tiles(row: Mapping[str, Any], other: Mapping[str, Any]) -> list[Tile]:
+    name = other["strategy"]
+    return [
+        Tile("Energy", shown(row["wh_per_km"], 2), "Wh/km", f"{name}: {shown(other['wh_per_km'], 2)}"),
+        Tile("Saving", shown(row["saving_percent"], 2), "%", f"against {name}"),
+        Tile("ΔSoC", shown(row["delta_soc_percent"], 3), "%", f"{name}: {shown(other['delta_soc_percent'], 3)}"),
+        Tile("Distance", shown(row["distance_km"], 3), "km", f"{name}: {shown(other['distance_km'], 3)}"),
+        Tile("Slip", f"{shown(row['min_slip'], 3)} … {shown(row['max_slip'], 3)}", "", "both axles, above 1 m/s"),
+        Tile("Front share", shown(row["share_changes_per_min"], 1), "/ min", "changes by more than 0.25"),
+    ]
+
+
+def _panels(driven: Driven, reference: Driven, critical_slip: float) -> list[Panel]:
+    run = driven.run
+    panels = [
+        Panel(
+            "Speed",
+            "m/s",
+            [Series("car", run["speed_mps"], BLUE), Series("cycle", run["trace_mps"], BLACK, dashed=True)],
+        ),
+        Panel(
+            "Power",
+            "kW",
+            [
+                Series("demand P_dem", run["power_demand_w"] / 1e3, GREY),
+                Series("front P_f", _axle_power_w(run, "front") / 1e3, BLUE),
+                Series("rear P_r", _axle_power_w(run, "rear") / 1e3, VERMILION),
+            ],
+        ),
+    ]
+    if not np.isnan(run["front_share"]).all():
+        panels.append(
+            Panel(
+                "Front share",
+                "",
+                [
+                    Series("applied", run["front_share"], BLUE),
+                    Series("decided", run["decided_share"], GREY, dashed=True, step=True),
+                ],
+                limits=(0.0, 1.0),
+            )
+        )
+    moving = run["speed_mps"] > MOVING_MPS
+    panels += [
+        Panel(
+            "Slip",
+            "",
+            [
+                Series("front", np.where(moving, run["front_slip"], np.nan), BLUE),
+                Series("rear", np.where(moving, run["rear_slip"], np.nan), VERMILION),
+            ],
+            decimals=4,
+            references=(
+                (-critical_slip, f"critical −{critical_slip:g}"),
+                (critical_slip, f"critical {critical_slip:g}"),
+            ),
+        ),
+        Panel(
+            "Torque of a wheel",
+            "N m",
+            [
+                Series("front motor", run["front_motor_nm"], BLUE),
+                Series("rear motor", run["rear_motor_nm"], VERMILION),
+                Series("front brake", run["front_friction_nm"], SKY, dashed=True),
+                Series("rear brake", run["rear_friction_nm"], OCHRE, dashed=True),
+            ],
+            decimals=1,
+        ),
+    ]
+    if not np.isnan(run["gate"]).all():
+        panels.append(
+            Panel(
+                "Gate",
+                "",
+                [Series("axles held at zero torque", run["gate"], PURPLE, step=True)],
+                ticks=tuple(enumerate(GATE_NAMES)),
+                limits=(0.0, 3.0),
+            )
+        )
+    panels.append(Panel("State of charge", "%", [Series("battery", 100.0 * run["soc"], GREEN)], decimals=3))
+    if reference.strategy != driven.strategy and len(reference.run.series) >= len(run.series):
+        used = reference.run["chemical_j"][: len(run.series)]
+        panels.append(
+            Panel(
+                "Energy saved",
+                "Wh",
+                [Series(f"against {reference.strategy}", (used - run["chemical_j"]) / 3600.0, GREEN)],
+            )
+        )
+    return panels
+
+
+def _axle_power_w(run: Run, axle: str) -> NDArray[np.float64]:
+    """What the law commanded, or, where that is not known, what motors and brakes did."""
+    commanded = run[f"{axle}_power_w"]
+    torque = run[f"{axle}_motor_nm"] + run[f"{axle}_friction_nm"]
+    return np.where(np.isnan(commanded), 2.0 * torque * run[f"{axle}_wheel_radps"], commanded)
