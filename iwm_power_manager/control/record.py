@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from iwm_power_manager.control.supervision import Supervision
-from iwm_power_manager.control.types import Command, ControllerState, Measurement, Settings
+from iwm_power_manager.control.types import Command, ControllerState, Measurement, Settings, default_settings
 
 _WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 _SETTING = "setting."
@@ -63,6 +63,7 @@ _SUPERVISION = (
     Signal("power_demand_age_s", "age of the power demand"),
     Signal("battery_state_age_s", "age of the battery's state"),
 )
+_SETTING_TYPES = {name: type(value) for name, value in default_settings()._asdict().items()}
 _SETTINGS = tuple(Signal(_SETTING + name, "the law's setting of that name") for name in Settings._fields)
 
 #: All signals, in the order in which they are published.
@@ -132,7 +133,5 @@ def from_numbers(values: Mapping[str, float]) -> RecordedStep:
     taken = [float(values[signal.name]) for signal in _MEASUREMENT]
     measurement = Measurement(taken[0], (taken[1], taken[2], taken[3], taken[4]), *taken[5:])
     # Integers and flags travel as numbers; the law has to get back the types it was compiled for.
-    kinds = Settings.__annotations__
-    convert = {"int": int, "bool": bool, "float": float}
-    settings = Settings(*(convert[kinds[name]](values[_SETTING + name]) for name in Settings._fields))
+    settings = Settings(*(kind(values[_SETTING + name]) for name, kind in _SETTING_TYPES.items()))
     return RecordedStep(values["step"] == 0.0, measurement, settings)

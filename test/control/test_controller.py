@@ -1,0 +1,377 @@
+"""The power manager without ROS: whatever comes in, what goes out is finite, limited, slew-limited and explained."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iwm_power_manager.actuation.limits import car_power_w
+from iwm_power_manager.control import controller as module
+from iwm_power_manager.control import law
+from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
+from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
+from iwm_power_manager.control.record import SIGNAL_NAMES, SIGNALS, from_numbers
+from iwm_power_manager.control.supervision import (
+    MODE_DEGRADED,
+    MODE_NORMAL,
+    MODE_RECOVERING,
+    MODE_WAITING,
+    STALE_BATTERY,
+    STALE_DEMAND,
+    STALE_SPEED,
+    STALE_WHEELS,
+    SupervisionLimits,
+)
+from iwm_power_manager.control.types import GATE_BOTH, GATE_FRONT, GATE_REAR, default_settings, initial_state
+from iwm_power_manager.nodes import power_manager_config as config
+from iwm_power_manager.policy import empty_table
+from iwm_power_manager.share import resolve
+from iwm_power_manager.vehicle import load_vehicle
+
+NAMES = ("front_left", "front_right", "rear_left", "rear_right")
+VEHICLE = load_vehicle(resolve(Path("config/vehicles/jalalmaab_2015.yaml"))).params
+RADIUS = VEHICLE.wheel.radius_m
+MS = 1_000_000
+DT = 0.01
+VALUES: dict[str, Any] = {spec.name: spec.default for spec in config.SPECS}
+LIMITS = ControllerLimits(
+    config.input_limits(VALUES, RADIUS), config.age_limits_s(VALUES), SupervisionLimits(0.3, 2.0, 0.1, 0.2)
+)
+STALE_ALL = STALE_SPEED | STALE_WHEELS | STALE_DEMAND | STALE_BATTERY
+
+
+class Drive:
+    """A controller and its clock."""
+
+    def __init__(self, limits: ControllerLimits = LIMITS, strategy: str = "equal") -> None:
+        self.controller = Controller(VEHICLE, NAMES, limits, default_settings(strategy), empty_table(), 0.9)
+        self.now_ns = 1000 * MS
+        self.steps: list[dict[str, float]] = []
+        self.commands: list[Any] = []
+
+    def step(self) -> dict[str, float]:
+        self.now_ns += 10 * MS
+        command, numbers = self.controller.step(self.now_ns, DT)
+        self.commands.append(command)
+        self.steps.append(dict(zip(SIGNAL_NAMES, numbers, strict=True)))
+        return self.steps[-1]
+
+    def send(self, speed=10.0, wheels=None, demand=5000.0, soc=0.5, temperature=25.0, without=()) -> None:
+        monitor, now = self.controller.monitor, self.now_ns
+        wheels = (speed / RADIUS,) * 4 if wheels is None else wheels
+        if "speed" not in without:
+            monitor.take_speed(SpeedReading(now, speed), now)
+        if "wheels" not in without:
+            monitor.take_wheels(JointReading(now, NAMES, tuple(wheels)), now)
+        if "battery" not in without:
+            monitor.take_battery(BatteryReading(now, soc, temperature, 237.0, 0.0), now)
+        if "demand" not in without:
+            monitor.take_demand(demand, 0.0, now)
+
+    def run(self, steps: int, **inputs: Any) -> dict[str, float]:
+        for _ in range(steps):
+            self.send(**inputs)
+            last = self.step()
+        return last
+
+
+def motor(values: dict[str, float]) -> list[float]:
+    return [values[f"{wheel}_motor_torque_nm"] for wheel in NAMES]
+
+
+def friction(values: dict[str, float]) -> list[float]:
+    return [values[f"{wheel}_friction_torque_nm"] for wheel in NAMES]
+
+
+@pytest.fixture
+def drive() -> Drive:
+    return Drive()
+
+
+class TestStart:
+    def test_before_any_input_it_waits_with_zero_torque(self, drive) -> None:
+        for _ in range(10):
+            values = drive.step()
+        assert values["mode"] == MODE_WAITING
+        assert values["stale"] == STALE_ALL
+        assert motor(values) == [0.0] * 4
+        assert friction(values) == [0.0] * 4
+
+    def test_torque_comes_once_all_inputs_have_been_good_for_a_while(self, drive) -> None:
+        modes = [drive.run(1)["mode"] for _ in range(60)]
+        assert modes[0] == MODE_WAITING
+        assert MODE_RECOVERING in modes
+        assert modes[-1] == MODE_NORMAL
+        assert sum(motor(drive.steps[-1])) * 10.0 / RADIUS == pytest.approx(5000.0)
+
+    def test_in_lockstep_the_first_step_drives(self) -> None:
+        drive = Drive(LIMITS._replace(age_s=None))
+        values = drive.run(1)
+        assert values["mode"] == MODE_NORMAL
+        assert values["power_demand_w"] == 5000.0
+        assert values["stale"] == 0
+
+
+class TestMissingInputs:
+    LIMIT_STEPS = 3
+
+    @pytest.mark.parametrize(
+        ("without", "bit"),
+        [("speed", STALE_SPEED), ("wheels", STALE_WHEELS), ("demand", STALE_DEMAND), ("battery", STALE_BATTERY)],
+    )
+    def test_any_missing_input_takes_the_drive_torque_away_in_the_stated_time(self, drive, without, bit) -> None:
+        drive.run(60)
+        fade_steps = 30
+        after = [drive.run(1, without=(without,)) for _ in range(90)]
+        first = next(i for i, values in enumerate(after) if values["stale"])
+        # battery_state comes ten times more slowly.
+        assert first <= (32 if without == "battery" else self.LIMIT_STEPS)
+        assert after[first]["stale"] == bit
+        assert after[first]["mode"] == MODE_DEGRADED
+        torques = [max(motor(values)) for values in after[first:]]
+        assert all(b <= a for a, b in zip(torques, torques[1:], strict=False))
+        assert torques[fade_steps] == 0.0
+        assert all(max(motor(values)) == 0.0 == min(motor(values)) for values in after[first + fade_steps :])
+
+    def test_it_recovers_by_itself(self, drive) -> None:
+        drive.run(60)
+        drive.run(60, without=("speed", "wheels", "demand", "battery"))
+        assert motor(drive.steps[-1]) == [0.0] * 4
+        back = [drive.run(1) for _ in range(60)]
+        assert [values["mode"] for values in back].index(MODE_RECOVERING) == pytest.approx(10, abs=1)
+        assert back[-1]["mode"] == MODE_NORMAL
+        torques = [max(motor(values)) for values in back]
+        assert max(b - a for a, b in zip(torques, torques[1:], strict=False)) <= 16.0 + 1e-9
+
+    def test_a_live_brake_demand_moves_from_the_motors_to_the_friction_brakes(self, drive) -> None:
+        drive.run(60, demand=-4000.0)
+        assert sum(motor(drive.steps[-1])) < -100.0
+        for without in (("wheels",), ("battery",)):
+            values = drive.run(90, demand=-4000.0, without=without)
+            assert motor(values) == [0.0] * 4
+            assert sum(friction(values)) * 10.0 / RADIUS == pytest.approx(-4000.0)
+
+    def test_with_the_speed_lost_the_wheels_tell_it(self, drive) -> None:
+        drive.run(60, demand=-4000.0)
+        wheels = (20.0, 21.0, 22.0, 23.0)
+        values = drive.run(20, demand=-4000.0, wheels=wheels, without=("speed",))
+        assert values["speed_mps"] == pytest.approx(23.0 * RADIUS)
+        values = drive.run(1, demand=4000.0, wheels=wheels, without=("speed",))
+        assert values["speed_mps"] == pytest.approx(20.0 * RADIUS)
+
+    def test_with_the_wheels_lost_the_speed_tells_theirs(self, drive) -> None:
+        drive.run(60)
+        values = drive.run(40, speed=10.2, without=("wheels",))
+        assert values["speed_mps"] == 10.2
+        assert [values[f"{wheel}_speed_radps"] for wheel in NAMES] == [10.2 / RADIUS] * 4
+
+    def test_with_both_lost_the_last_ones_are_held(self, drive) -> None:
+        drive.run(60)
+        values = drive.run(40, without=("wheels", "speed"))
+        assert values["speed_mps"] == 10.0
+        assert [values[f"{wheel}_speed_radps"] for wheel in NAMES] == [10.0 / RADIUS] * 4
+
+    def test_a_stale_brake_demand_is_let_go_slowly_and_never_drives(self, drive) -> None:
+        drive.run(60, demand=-8000.0)
+        after = [drive.run(1, without=("demand",)) for _ in range(230)]
+        total = [sum(motor(values)) + sum(friction(values)) for values in after]
+        assert all(torque <= 0.0 for torque in total)
+        assert all(max(motor(values)) <= 0.0 for values in after)
+        held = total[:3]
+        assert total[100] == pytest.approx(0.5 * held[0], rel=0.05)
+        assert total[-1] == 0.0
+
+    def test_the_record_tells_the_ages_and_the_request(self, drive) -> None:
+        drive.run(60)
+        values = drive.run(5, demand=7000.0, without=("speed",))
+        assert values["vehicle_speed_age_s"] == pytest.approx(0.06)
+        assert values["power_demand_age_s"] == pytest.approx(0.01)
+        assert values["requested_power_w"] == 7000.0
+        assert values["power_demand_w"] < 7000.0
+
+
+class TestLostWheel:
+    def test_the_other_wheel_of_the_axle_stands_in_and_slip_is_judged_more_strictly(self, drive) -> None:
+        drive.run(60)
+        values = drive.run(2, wheels=(math.nan, 30.0, 30.5, 30.5))
+        assert values["wheels_lost"] == 1
+        assert values["front_left_speed_radps"] == 30.0
+        assert values["setting.critical_slip"] == default_settings().critical_slip / 2
+        assert values["setting.slip_target"] == default_settings().slip_target / 2
+        assert values["setting.gate_hysteresis"] == default_settings().gate_hysteresis / 2
+        assert values["mode"] == MODE_NORMAL
+        assert min(motor(values)) > 0.0
+        values = drive.run(100)
+        assert values["wheels_lost"] == 0
+        assert values["setting.critical_slip"] == default_settings().critical_slip
+
+    def test_each_wheel_has_its_bit(self, drive) -> None:
+        drive.run(60)
+        assert drive.run(1, wheels=(30.0, math.nan, math.nan, 30.0))["wheels_lost"] == 6
+
+    def test_an_axle_without_wheels_counts_as_missing_wheels(self, drive) -> None:
+        drive.run(60)
+        values = drive.run(5, wheels=(math.nan, math.nan, 30.0, 30.0))
+        assert values["stale"] == STALE_WHEELS
+
+
+class TestBattery:
+    def test_a_full_battery_takes_nothing_and_friction_brakes(self) -> None:
+        drive = Drive()
+        values = drive.run(60, demand=-4000.0, soc=1.0)
+        assert values["charge_limit_w"] == 0.0
+        front, _, rear, _ = motor(values)
+        # A little braking torque is left to the motors: what their own losses eat up.
+        assert car_power_w(front, rear, 10.0 / RADIUS, 10.0 / RADIUS, VEHICLE.motor) >= -1e-6
+        assert (sum(friction(values)) + sum(motor(values))) * 10.0 / RADIUS == pytest.approx(-4000.0)
+        assert sum(friction(values)) < 10.0 * sum(motor(values))
+
+    def test_a_hot_battery_gives_and_takes_less(self) -> None:
+        values = Drive().run(60, temperature=52.5)
+        assert values["discharge_limit_w"] == pytest.approx(0.5 * VEHICLE.battery.discharge_limit_w)
+        assert values["charge_limit_w"] == pytest.approx(0.5 * VEHICLE.battery.charge_limit_w)
+
+    def test_an_empty_battery_gives_nothing(self) -> None:
+        values = Drive().run(60, soc=0.02)
+        assert values["discharge_limit_w"] == 0.0
+        assert max(motor(values)) == 0.0
+
+
+class TestRecord:
+    def test_signals_have_unique_names_and_meanings(self) -> None:
+        assert len(set(SIGNAL_NAMES)) == len(SIGNAL_NAMES)
+        assert all(signal.meaning for signal in SIGNALS)
+
+    def test_a_recorded_run_can_be_repeated_bit_for_bit(self) -> None:
+        drive = Drive(strategy="instantaneous_slip")
+        drive.run(70, demand=9000.0)
+        drive.run(20, demand=-9000.0)
+        drive.run(20, demand=9000.0, without=("wheels",))
+        drive.run(30, demand=-3000.0, wheels=(5.0, math.nan, 20.0, 20.0))
+        drive.controller.reset()
+        drive.run(50, demand=-3000.0)
+        state = initial_state()
+        for values, command in zip(drive.steps, drive.commands, strict=True):
+            recorded = from_numbers(values)
+            if recorded.first:
+                state = initial_state()
+            again, state = law.step(recorded.measurement, state, recorded.settings, VEHICLE, empty_table())
+            assert again == command
+        assert sum(from_numbers(values).first for values in drive.steps) == 2
+
+    def test_settings_come_back_with_the_types_the_law_was_compiled_for(self, drive) -> None:
+        settings_again = from_numbers(drive.run(1)).settings
+        assert settings_again == default_settings()
+        assert [type(a) for a in settings_again] == [type(b) for b in default_settings()]
+
+    def test_a_record_that_lacks_a_signal_is_refused(self, drive) -> None:
+        values = drive.run(1)
+        del values["dt_s"]
+        with pytest.raises(KeyError):
+            from_numbers(values)
+
+
+class TestFaultOfTheLaw:
+    @pytest.mark.parametrize("torque", [math.nan, 1e6])
+    def test_what_no_motor_may_be_given_never_leaves(self, drive, monkeypatch, torque) -> None:
+        drive.run(60)
+        good = drive.controller.command
+
+        real = law.step
+
+        def broken(*arguments: Any) -> Any:
+            command, after = real(*arguments)
+            return command._replace(motor_torque_nm=(torque, 0.0, 0.0, 0.0)), after
+
+        monkeypatch.setattr(module.law, "step", broken)
+        state = drive.controller.state
+        with pytest.raises(ControlFaultError, match="wheel 0"):
+            drive.controller.step(drive.now_ns, DT)
+        assert drive.controller.command is good
+        assert drive.controller.state is state
+
+
+# What a broken network, a broken sensor or a broken program may send.
+numbers = st.one_of(st.floats(), st.floats(-100.0, 100.0), st.sampled_from([math.nan, math.inf, -math.inf, 1e308, 0.0]))
+names = st.one_of(
+    st.just(NAMES),
+    st.permutations(NAMES).map(tuple),
+    st.lists(st.sampled_from((*NAMES, "other", "")), max_size=6).map(tuple),
+)
+stamps = st.one_of(st.integers(-40, 5), st.integers(-10_000, 10_000))
+messages = st.one_of(
+    st.tuples(st.just("speed"), stamps, st.one_of(numbers, st.floats(0.0, 40.0))),
+    st.tuples(st.just("wheels"), stamps, names, st.lists(st.one_of(numbers, st.floats(0.0, 120.0)), max_size=6)),
+    st.tuples(st.just("demand"), st.floats(0.0, 0.3), st.one_of(numbers, st.floats(-2e5, 1e5))),
+    st.tuples(st.just("battery"), stamps, st.one_of(numbers, st.floats(0.0, 1.0)), numbers),
+    st.tuples(st.just("friction"), st.just(0), numbers),
+    st.tuples(st.just("good"), st.floats(0.0, 40.0), st.floats(-3e4, 3e4)),
+    st.tuples(st.just("good"), st.just(10.0), st.floats(-3e4, 3e4)),
+)
+sequences = st.lists(st.lists(messages, max_size=4), min_size=1, max_size=30)
+
+
+def feed(drive: Drive, message: tuple[Any, ...]) -> None:
+    monitor, now = drive.controller.monitor, drive.now_ns
+    kind = message[0]
+    if kind == "good":
+        drive.send(speed=message[1], demand=message[2])
+    elif kind == "demand":
+        monitor.take_demand(message[2], message[1], now)
+    elif kind == "friction":
+        monitor.take_friction(message[2], now)
+    else:
+        stamp = now + message[1] * MS
+        if kind == "speed":
+            monitor.take_speed(SpeedReading(stamp, message[2]), now)
+        elif kind == "wheels":
+            monitor.take_wheels(JointReading(stamp, message[2], tuple(message[3])), now)
+        else:
+            monitor.take_battery(BatteryReading(stamp, message[2], message[3], 237.0, 0.0), now)
+
+
+@settings(max_examples=max(settings().max_examples, 500))
+@given(sequences, st.sampled_from(["equal", "instantaneous", "instantaneous_slip"]), st.booleans())
+def test_whatever_comes_in_every_command_is_finite_limited_and_slew_limited(sequence, strategy, healthy_first) -> None:
+    drive = Drive(strategy=strategy)
+    if healthy_first:
+        drive.run(35)
+    up = drive.controller.settings.slew_up_nmps * DT
+    before = drive.commands[-1].motor_torque_nm if drive.commands else (0.0,) * 4
+    peak, power = VEHICLE.motor.peak_torque_nm, VEHICLE.motor.max_power_w
+    for batch in sequence:
+        for message in batch:
+            feed(drive, message)
+        values = drive.step()
+        command = drive.commands[-1]
+        assert all(math.isfinite(number) or name.endswith("age_s") for name, number in values.items())
+        for i, wheel in enumerate(NAMES):
+            torque, brake = command.motor_torque_nm[i], command.friction_torque_nm[i]
+            assert abs(torque) <= peak + 1e-6
+            assert torque * values[f"{wheel}_speed_radps"] <= power * (1.0 + 1e-9)
+            assert -VEHICLE.friction_brake.max_torque_nm - 1e-6 <= brake <= 0.0
+            assert torque <= max(before[i], 0.0) + up + 1e-9
+            gated = (GATE_FRONT, GATE_BOTH) if i < 2 else (GATE_REAR, GATE_BOTH)
+            if command.gate in gated:
+                assert torque == 0.0
+                assert brake == 0.0
+        if values["power_demand_w"] <= 0.0 and max(before) <= 0.0:
+            assert max(command.motor_torque_nm) <= 0.0
+        if values["motor_factor"] == 0.0:
+            assert command.motor_torque_nm == (0.0,) * 4
+        assert drive.controller.state.steps == len(drive.steps)
+        before = command.motor_torque_nm
+
+
+@given(st.floats(3.0, 30.0), st.floats(-20000.0, 20000.0))
+def test_the_torques_sum_to_the_demand_whenever_no_limit_and_no_gate_binds(speed, demand) -> None:
+    drive = Drive()
+    values = drive.run(60, speed=speed, demand=demand)
+    if values["limits"] == 0 and values["gate"] == 0:
+        total = sum(t * values[f"{w}_speed_radps"] for t, w in zip(motor(values), NAMES, strict=True))
+        assert total == pytest.approx(demand, abs=1e-3)

@@ -1,0 +1,311 @@
+"""The latest good input of each topic: what is kept, dropped, counted, and how old it is."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from iwm_power_manager.control.inputs import StampLimits, ValueLimits, Violation, WheelLimits, WheelVerdict
+from iwm_power_manager.control.monitor import (
+    BATTERY,
+    DEMAND,
+    FRICTION,
+    SPEED,
+    WHEELS,
+    BatteryReading,
+    InputLimits,
+    InputMonitor,
+    JointReading,
+    SpeedReading,
+    Tally,
+    select_by_name,
+)
+
+NAMES = ("front_left", "front_right", "rear_left", "rear_right")
+MS = 1_000_000
+NOW = 5_000 * MS
+LIMITS = InputLimits(
+    stamp=StampLimits(0.1, 0.02),
+    demand_delay_s=0.1,
+    speed=ValueLimits(-1.0, 60.0, 20.0, 20.0, 0.5),
+    demand=ValueLimits(-1e5, 5e4, 1e6, math.inf, 1e3),
+    soc=ValueLimits(0.0, 1.0, 0.01, 0.01, 0.02),
+    temperature=ValueLimits(-60.0, 150.0, 2.0, 2.0, 3.0),
+    friction=ValueLimits(0.05, 1.5, math.inf, math.inf, 0.0),
+    wheels=WheelLimits(ValueLimits(-200.0, 200.0, 1000.0, 1000.0, 2.0), 2.0, 1.0, 1.0, 1.0, 1.0, 20.0, 0.0),
+    radius_m=0.5,
+)
+
+
+@pytest.fixture
+def monitor() -> InputMonitor:
+    return InputMonitor(NAMES, LIMITS)
+
+
+def wheels(stamp_ns: int, values=(20.0, 20.0, 20.0, 20.0), names=NAMES) -> JointReading:
+    return JointReading(stamp_ns, tuple(names), tuple(values))
+
+
+def battery(stamp_ns: int, soc=0.5, temperature=25.0) -> BatteryReading:
+    return BatteryReading(stamp_ns, soc, temperature, 237.0, 10.0)
+
+
+class TestSelectByName:
+    def test_values_come_in_the_order_asked_for(self) -> None:
+        assert select_by_name(wheels(0, (3.0, 1.0, 4.0, 2.0), ("c", "a", "d", "b")), ("a", "b", "c", "d")) == (1, 2, 3, 4)
+        assert select_by_name(wheels(0, (1.0, 2.0), ("a", "b")), ("a", "b")) == (1.0, 2.0)
+
+    def test_a_name_that_is_absent_or_doubled_has_no_value(self) -> None:
+        found = select_by_name(wheels(0, (1.0, 2.0, 3.0), ("a", "b", "b")), ("a", "b", "c"))
+        assert found[0] == 1.0
+        assert math.isnan(found[1])
+        assert math.isnan(found[2])
+
+    @pytest.mark.parametrize("values", [(), (1.0,), (1.0, 2.0, 3.0)])
+    def test_without_a_value_for_each_name_nothing_is_known(self, values) -> None:
+        found = select_by_name(wheels(0, values, ("a", "b")), ("a", "b"))
+        assert len(found) == 2
+        assert all(math.isnan(value) for value in found)
+
+
+class TestTally:
+    def test_the_age_is_infinite_before_the_first_message_and_never_negative(self) -> None:
+        tally = Tally()
+        assert tally.age_s(NOW) == math.inf
+        assert tally.note(Violation.NONE, NOW) is True
+        assert tally.age_s(NOW + 250 * MS) == 0.25
+        assert tally.age_s(NOW - 250 * MS) == 0.0
+
+    def test_a_dropped_message_is_counted_and_does_not_make_the_input_younger(self) -> None:
+        tally = Tally()
+        tally.note(Violation.NONE, NOW)
+        assert tally.note(Violation.NOT_FINITE, NOW + MS) is False
+        assert tally.note(Violation.NOT_FINITE, NOW + MS) is False
+        assert tally.accepted_ns == NOW
+        assert tally.received == 3
+        assert dict(tally.dropped) == {Violation.NOT_FINITE: 2}
+        assert tally.violation is Violation.NOT_FINITE
+        tally.note(Violation.NONE, NOW + 2 * MS)
+        assert tally.violation is Violation.NONE
+
+
+class TestSpeed:
+    def test_a_good_speed_is_kept_with_its_stamp(self, monitor) -> None:
+        assert monitor.take_speed(SpeedReading(NOW - 10 * MS, 12.5), NOW)
+        assert monitor.speed_mps == 12.5
+        assert monitor.ages_s(NOW)[0] == 0.01
+        assert math.isinf(monitor.ages_s(NOW)[1])
+
+    def test_noise_below_zero_is_standstill(self, monitor) -> None:
+        assert monitor.take_speed(SpeedReading(NOW, -0.3), NOW)
+        assert monitor.speed_mps == 0.0
+
+    def test_the_first_speed_may_be_any(self, monitor) -> None:
+        assert monitor.take_speed(SpeedReading(NOW, 59.0), NOW)
+
+    @pytest.mark.parametrize(
+        ("stamp_ms", "speed", "violation"),
+        [
+            (10, math.nan, Violation.NOT_FINITE),
+            (10, 61.0, Violation.OUT_OF_RANGE),
+            (10, 11.0, Violation.TOO_FAST),
+            (31, 10.0, Violation.STAMP_IN_FUTURE),
+            (-91, 10.0, Violation.STAMP_TOO_OLD),
+            (0, 10.0, Violation.STAMP_NOT_NEWER),
+        ],
+    )
+    def test_a_bad_speed_is_dropped_and_the_last_good_one_stays(self, monitor, stamp_ms, speed, violation) -> None:
+        monitor.take_speed(SpeedReading(NOW, 10.0), NOW)
+        assert not monitor.take_speed(SpeedReading(NOW + stamp_ms * MS, speed), NOW + 10 * MS)
+        assert monitor.speed_mps == 10.0
+        assert monitor.tallies[SPEED].violation is violation
+        assert monitor.tallies[SPEED].dropped[violation] == 1
+
+    def test_the_change_is_judged_over_the_time_between_the_stamps(self, monitor) -> None:
+        monitor.take_speed(SpeedReading(NOW, 10.0), NOW)
+        assert not monitor.take_speed(SpeedReading(NOW + 20 * MS, 10.95), NOW + 50 * MS)
+        assert monitor.take_speed(SpeedReading(NOW + 50 * MS, 11.5), NOW + 50 * MS)
+
+    def test_without_stamp_limits_any_stamp_will_do(self) -> None:
+        monitor = InputMonitor(NAMES, LIMITS._replace(stamp=None))
+        assert monitor.take_speed(SpeedReading(NOW, 10.0), 0)
+        assert monitor.take_speed(SpeedReading(NOW, 10.0), 10**18)
+
+
+class TestWheels:
+    def test_wheels_are_matched_by_name(self, monitor) -> None:
+        shuffled = ("rear_right", "front_left", "rear_left", "front_right")
+        assert monitor.take_wheels(wheels(NOW, (4.0, 1.0, 3.0, 2.0), shuffled), NOW)
+        assert monitor.wheel_speed_radps == (1.0, 2.0, 3.0, 4.0)
+        assert monitor.verdicts == (WheelVerdict.GOOD,) * 4
+        assert monitor.ages_s(NOW)[1] == 0.0
+
+    def test_a_message_without_one_wheel_is_counted_and_its_other_wheels_are_used(self, monitor) -> None:
+        assert monitor.take_wheels(wheels(NOW, (1.0, 2.0, 3.0), NAMES[:3]), NOW)
+        assert monitor.wheel_speed_radps == (1.0, 2.0, 3.0, 3.0)
+        assert monitor.verdicts[3] is WheelVerdict.ABSENT
+        tally = monitor.tallies[WHEELS]
+        assert (tally.received, tally.accepted_ns, tally.violation) == (1, NOW, Violation.NAME_MISSING)
+        assert tally.dropped[Violation.NAME_MISSING] == 1
+
+    @pytest.mark.parametrize(
+        ("values", "names", "violation"),
+        [
+            ((1.0, 2.0, 3.0), NAMES, Violation.LENGTH),
+            ((), NAMES, Violation.LENGTH),
+            ((1.0, 2.0, 3.0, 4.0), ("front_left", "front_left", "rear_left", "rear_right"), Violation.NAME_TWICE),
+            ((), (), Violation.AXLE_LOST),
+            ((math.nan, math.nan, 3.0, 4.0), NAMES, Violation.AXLE_LOST),
+            ((1.0, 2.0), ("front_left", "front_right"), Violation.AXLE_LOST),
+        ],
+    )
+    def test_a_message_that_leaves_an_axle_unknown_is_dropped(self, monitor, values, names, violation) -> None:
+        monitor.take_wheels(wheels(NOW), NOW)
+        assert not monitor.take_wheels(wheels(NOW + 10 * MS, values, names), NOW + 10 * MS)
+        assert monitor.wheel_speed_radps == (20.0,) * 4
+        assert monitor.tallies[WHEELS].accepted_ns == NOW
+        assert monitor.tallies[WHEELS].violation is violation
+
+    def test_a_bad_stamp_is_seen_before_anything_else(self, monitor) -> None:
+        assert not monitor.take_wheels(wheels(NOW - 101 * MS, (), NAMES), NOW)
+        assert monitor.tallies[WHEELS].violation is Violation.STAMP_TOO_OLD
+
+    def test_a_wheel_that_jumps_is_judged_over_the_time_between_the_stamps(self, monitor) -> None:
+        monitor.take_wheels(wheels(NOW), NOW)
+        # 1000 rad/s2 over 10 ms, and 2 for noise.
+        assert monitor.take_wheels(wheels(NOW + 10 * MS, (32.1, 20.0, 20.0, 20.0)), NOW + 10 * MS)
+        assert monitor.verdicts[0] is WheelVerdict.JUMPED
+        assert monitor.wheel_speed_radps == (20.0,) * 4
+        assert monitor.take_wheels(wheels(NOW + 20 * MS, (31.9, 20.0, 20.0, 20.0)), NOW + 20 * MS)
+        assert monitor.wheel_speed_radps[0] == 31.9
+
+    def test_time_of_dropped_messages_is_counted_once(self, monitor) -> None:
+        monitor.take_wheels(wheels(NOW), NOW)
+        for i in range(1, 4):
+            monitor.take_wheels(wheels(NOW + 10 * i * MS, (math.nan,) * 4), NOW + 10 * i * MS)
+        # 40 ms after the last good speed 42 rad/s more are the most that is believed.
+        assert not monitor.take_wheels(wheels(NOW + 40 * MS, (62.5,) * 4), NOW + 40 * MS)
+        assert monitor.take_wheels(wheels(NOW + 41 * MS, (62.5,) * 4), NOW + 41 * MS)
+
+    def test_the_speed_of_the_car_is_seen_at_the_wheel(self, monitor) -> None:
+        monitor.take_speed(SpeedReading(NOW, 0.9), NOW)
+        monitor.take_wheels(wheels(NOW, (-5.0, 2.0, 2.0, 2.0)), NOW)
+        assert monitor.verdicts[0] is WheelVerdict.GOOD
+        monitor.take_speed(SpeedReading(NOW + 10 * MS, 1.1), NOW + 10 * MS)
+        monitor.take_wheels(wheels(NOW + 10 * MS, (-5.0, 2.0, 2.0, 2.0)), NOW + 10 * MS)
+        assert monitor.verdicts[0] is WheelVerdict.OPPOSITE
+
+
+class TestDemand:
+    def test_a_demand_is_kept_with_the_speed_of_its_moment(self, monitor) -> None:
+        monitor.take_speed(SpeedReading(NOW, 12.0), NOW)
+        assert monitor.take_demand(-5000.0, 0.001, NOW)
+        monitor.take_speed(SpeedReading(NOW + 10 * MS, 11.9), NOW + 10 * MS)
+        assert (monitor.demand_w, monitor.demand_speed_mps) == (-5000.0, 12.0)
+        assert monitor.ages_s(NOW + 30 * MS)[2] == 0.03
+
+    def test_a_late_demand_is_dropped(self, monitor) -> None:
+        assert monitor.take_demand(1.0, 0.1, NOW)
+        assert not monitor.take_demand(2.0, 0.1001, NOW + MS)
+        assert monitor.demand_w == 1.0
+        assert monitor.tallies[DEMAND].violation is Violation.LATE
+
+    def test_a_demand_may_fall_at_once_but_not_rise_at_once(self, monitor) -> None:
+        assert monitor.take_demand(5e4, 0.0, NOW)
+        assert monitor.take_demand(-1e5, 0.0, NOW + MS)
+        assert not monitor.take_demand(-9e4, 0.0, NOW + 2 * MS)
+        assert monitor.take_demand(-9e4, 0.0, NOW + 10 * MS)
+        assert monitor.tallies[DEMAND].dropped == {Violation.TOO_FAST: 1}
+
+    @pytest.mark.parametrize("demand", [math.nan, -math.inf, 5.1e4, -1.1e5])
+    def test_an_impossible_demand_is_dropped(self, monitor, demand) -> None:
+        assert not monitor.take_demand(demand, 0.0, NOW)
+        assert monitor.demand_w == 0.0
+        assert math.isinf(monitor.ages_s(NOW)[2])
+
+
+class TestBattery:
+    def test_charge_and_temperature_are_kept(self, monitor) -> None:
+        assert monitor.take_battery(battery(NOW, 0.7, 31.0), NOW)
+        assert (monitor.soc, monitor.temperature_c) == (0.7, 31.0)
+        assert monitor.ages_s(NOW + 100 * MS)[3] == 0.1
+
+    def test_a_temperature_that_is_not_measured_is_allowed(self, monitor) -> None:
+        assert monitor.take_battery(battery(NOW, 0.7, math.nan), NOW)
+        assert math.isnan(monitor.temperature_c)
+        assert monitor.take_battery(battery(NOW + 10 * MS, 0.7, 60.0), NOW + 10 * MS)
+        assert monitor.temperature_c == 60.0
+
+    @pytest.mark.parametrize(
+        ("soc", "temperature", "violation"),
+        [
+            (math.nan, 25.0, Violation.NOT_FINITE),
+            (1.01, 25.0, Violation.OUT_OF_RANGE),
+            (0.53, 25.0, Violation.TOO_FAST),
+            (0.5, 29.0, Violation.TOO_FAST),
+            (0.5, 151.0, Violation.OUT_OF_RANGE),
+            (0.5, math.inf, Violation.NOT_FINITE),
+        ],
+    )
+    def test_an_impossible_battery_is_dropped(self, monitor, soc, temperature, violation) -> None:
+        monitor.take_battery(battery(NOW), NOW)
+        assert not monitor.take_battery(battery(NOW + 10 * MS, soc, temperature), NOW + 10 * MS)
+        assert (monitor.soc, monitor.temperature_c) == (0.5, 25.0)
+        assert monitor.tallies[BATTERY].violation is violation
+
+    def test_a_bad_stamp_is_seen(self, monitor) -> None:
+        assert not monitor.take_battery(battery(NOW + 21 * MS), NOW)
+        assert monitor.tallies[BATTERY].violation is Violation.STAMP_IN_FUTURE
+
+    def test_a_slow_change_is_believed(self, monitor) -> None:
+        monitor.take_battery(battery(NOW, 0.5, 25.0), NOW)
+        later = NOW + 2_000 * MS
+        assert monitor.take_battery(battery(later, 0.539, 31.9), later)
+
+
+class TestFriction:
+    def test_a_friction_in_range_is_kept(self, monitor) -> None:
+        assert math.isnan(monitor.friction)
+        assert monitor.take_friction(0.3, NOW)
+        assert monitor.friction == 0.3
+        assert monitor.tallies[FRICTION].age_s(NOW + 500 * MS) == 0.5
+
+    @pytest.mark.parametrize("friction", [math.nan, 0.0, 2.0])
+    def test_an_impossible_friction_is_dropped(self, monitor, friction) -> None:
+        monitor.take_friction(0.3, NOW)
+        assert not monitor.take_friction(friction, NOW + MS)
+        assert monitor.friction == 0.3
+
+
+class TestCompleteness:
+    def test_it_is_complete_when_every_needed_input_came_once(self, monitor) -> None:
+        taken = (
+            lambda: monitor.take_speed(SpeedReading(NOW, 10.0), NOW),
+            lambda: monitor.take_wheels(wheels(NOW), NOW),
+            lambda: monitor.take_demand(0.0, 0.0, NOW),
+            lambda: monitor.take_battery(battery(NOW), NOW),
+        )
+        for take in taken:
+            assert not monitor.complete
+            take()
+        assert monitor.complete
+
+    def test_forgetting_keeps_the_counters_and_nothing_else(self, monitor) -> None:
+        monitor.take_speed(SpeedReading(NOW, 30.0), NOW)
+        monitor.take_wheels(wheels(NOW, (math.nan, 20.0, 20.0, 20.0)), NOW)
+        monitor.take_demand(1000.0, 0.0, NOW)
+        monitor.take_battery(battery(NOW, 0.9, 40.0), NOW)
+        monitor.take_friction(0.4, NOW)
+        monitor.forget()
+        assert not monitor.complete
+        assert monitor.ages_s(NOW) == (math.inf,) * 4
+        assert (monitor.speed_mps, monitor.demand_w, monitor.demand_speed_mps, monitor.soc) == (0.0, 0.0, 0.0, 0.5)
+        assert monitor.wheel_speed_radps == (0.0,) * 4
+        assert monitor.verdicts == (WheelVerdict.GOOD,) * 4
+        assert math.isnan(monitor.temperature_c)
+        assert math.isnan(monitor.friction)
+        assert [monitor.tallies[t].received for t in (SPEED, WHEELS, DEMAND, BATTERY, FRICTION)] == [1] * 5
+        # A stamp of before is as good as any now: the clock may have been set back.
+        assert monitor.take_speed(SpeedReading(NOW - 50 * MS, 3.0), NOW - 50 * MS)
+        assert monitor.take_wheels(wheels(NOW - 50 * MS, (90.0,) * 4), NOW - 50 * MS)
