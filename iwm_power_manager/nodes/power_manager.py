@@ -14,6 +14,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
@@ -102,6 +103,9 @@ class PowerManager(LifecycleNode):
         self._last_step_ns: int | None = None
         self._last_step_steady_s = 0.0
         self._answer: tuple[JointState, JointState, JointState] | None = None
+        # rclpy lets a transition that the present state does not have end in an exception; its client would wait forever.
+        self._change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._change_state_if_possible
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._report = PowerManagerReport(self.get_name(), self._wheel_names, None)
         self._report_due = False
@@ -179,6 +183,25 @@ class PowerManager(LifecycleNode):
         """Deactivate, if active."""
         if self._active:
             self.trigger_deactivate()
+
+    def fail(self, problem: str) -> None:
+        """Zero torque, inactive, and the reason on `/diagnostics`: the state every unexpected error leads to."""
+        self._fault = problem
+        self.get_logger().fatal(f"zero torque and inactive: {problem}")
+        self.stop()
+
+    def _change_state_if_possible(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        possible = {(found[0], found[1]) for found in self._state_machine.available_transitions}
+        wanted = request.transition
+        by_label = bool(wanted.label)
+        if not any(wanted.label == label if by_label else wanted.id == number for number, label in possible):
+            name = wanted.label if by_label else wanted.id
+            self.get_logger().warning(f"there is no transition {name} from state {self._lifecycle_state()}")
+            response.success = False
+            return response
+        return self._change_state(request, response)
 
     def _build(self) -> None:
         values = self._values
@@ -350,9 +373,7 @@ class PowerManager(LifecycleNode):
         try:
             command, numbers = self._controller.step(stamp_ns, dt_s)
         except ControlFaultError as error:
-            self._fault = str(error)
-            self.get_logger().fatal(f"zero torque and inactive: {error}")
-            self.trigger_deactivate()
+            self.fail(str(error))
             return
         self._answer = (
             messages.torque_command_message(stamp_ns, self._wheel_names, command.motor_torque_nm),
@@ -503,7 +524,10 @@ def main(args: list[str] | None = None) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while started and not stopped:
-        executor.spin_once()
+        try:
+            executor.spin_once()
+        except Exception as error:  # noqa: BLE001 - whatever it is, the motors must not be left with a command
+            node.fail(f"{type(error).__name__}: {error}")
     node.stop()
     executor.shutdown()
     node.destroy_node()

@@ -115,7 +115,7 @@ class Bench:
         }
         if sim_time:
             self.publishers[messages.CLOCK] = self.node.create_publisher(
-                messages.TOPIC_TYPES[messages.CLOCK], messages.CLOCK, keep_all
+                messages.TOPIC_TYPES[messages.CLOCK], f"{namespace}/clock", keep_all
             )
         self.torques: list[JointState] = []
         self.frictions: list[JointState] = []
@@ -125,7 +125,9 @@ class Bench:
         self.node.create_subscription(JointState, messages.WHEEL_TORQUE_COMMAND, self.torques.append, keep_all)
         self.node.create_subscription(JointState, messages.FRICTION_BRAKE_COMMAND, self.frictions.append, keep_all)
         self.node.create_subscription(JointState, messages.POWER_MANAGER_STATE, self._on_state, keep_all)
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, keep_all)
+        self.node.create_subscription(
+            DiagnosticArray, f"{namespace}/diagnostics", self.diagnostics.append, keep_all
+        )
         self.clients: dict[str, Any] = {}
 
     def _on_state(self, message: JointState) -> None:

@@ -1,0 +1,62 @@
+"""Nodes over real DDS: every test run has a domain of its own, every test a namespace."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from bench import Bench, Running, arguments
+
+MODULE = "iwm_power_manager.nodes.power_manager"
+#: Runs without a policy file, which is all most tests need.
+EQUAL = {"strategy": "equal", "policy_file": ""}
+
+
+class Pair:
+    """A power manager and a bench in one namespace."""
+
+    _count = 0
+
+    def __init__(self, folder: Path, parameters: dict[str, Any], *, sim_time: bool = False) -> None:
+        Pair._count += 1
+        domain = int(os.environ["ROS_DOMAIN_ID"])
+        namespace = f"/test_{os.getpid()}_{Pair._count}"
+        self.bench = Bench(
+            domain, lockstep=bool(parameters.get("lockstep")), namespace=namespace, sim_time=sim_time
+        )
+        remaps = {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics", "/clock": f"{namespace}/clock"}
+        self.arguments = arguments({**EQUAL, **parameters, "use_sim_time": sim_time}, remaps)
+        self._folder, self._domain = folder, domain
+        self.running = self.start()
+
+    def start(self) -> Running:
+        """Start the node (again)."""
+        self.running = Running(MODULE, self.arguments, self._domain, self._folder)
+        return self.running
+
+    def close(self) -> None:
+        """End both."""
+        self.bench.close()
+        self.running.process.kill()
+        self.running.process.wait()
+
+
+@pytest.fixture(scope="module")
+def start_pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Pair]]:
+    """Start a power manager with parameters; all end with the module."""
+    pairs: list[Pair] = []
+
+    def start(parameters: dict[str, Any] | None = None, **options: Any) -> Pair:
+        pairs.append(Pair(tmp_path_factory.mktemp("node"), parameters or {}, **options))
+        return pairs[-1]
+
+    yield start
+    for pair in pairs:
+        pair.close()
