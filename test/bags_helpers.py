@@ -2,12 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import struct
+from pathlib import Path
 
-from iwm_power_manager.bags.definitions import definition_of
+import numpy as np
+
+from iwm_power_manager.bags import steps
+from iwm_power_manager.bags.definitions import definition_of, typestore
+from iwm_power_manager.bags.joint_state import JOINT_STATE, JointStateEncoder
 from iwm_power_manager.bags.metadata import Qos, Topic
+from iwm_power_manager.bags.plan import WHEEL_NAMES
+from iwm_power_manager.bags.replay import COMPUTED
+from iwm_power_manager.bags.writer import BagWriter
+from iwm_power_manager.control.controller import Controller, ControllerLimits
+from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
+from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.control.supervision import SupervisionLimits
+from iwm_power_manager.control.types import Settings, default_settings
+from iwm_power_manager.policy import empty_table
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
 
 FLOAT64 = "std_msgs/msg/Float64"
+TWIST = "geometry_msgs/msg/TwistStamped"
+BATTERY = "sensor_msgs/msg/BatteryState"
 
 
 def float64(value: float) -> bytes:
@@ -18,3 +37,83 @@ def float64(value: float) -> bytes:
 def topic(name: str, msgtype: str = FLOAT64) -> Topic:
     """A topic with its true definition and hash."""
     return Topic(name, msgtype, *definition_of(msgtype), (Qos(),))
+
+
+class ScriptedDrive:
+    """A drive written into a bag by the same `Controller` the node has: inputs, commands and state, as in lock-step.
+
+    The car is no model: speed follows a smooth script, with some slip, driving and braking.
+    """
+
+    DT_NS = 10_000_000
+
+    def __init__(self, settings: Settings | None = None, strategy: str = "instantaneous_slip") -> None:
+        self.vehicle = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"))
+        self.settings = settings or default_settings(strategy)
+        limits = ControllerLimits(
+            steps._INPUT_LIMITS._replace(radius_m=0.33), None, SupervisionLimits(0.3, 2, 0.5, 0.5)
+        )
+        self.controller = Controller(self.vehicle.params, WHEEL_NAMES, limits, self.settings, empty_table(), 0.9)
+
+    def inputs(self, i: int) -> tuple[float, list[float], float]:
+        """Speed, wheel speeds and demand of step `i`."""
+        t = i * 0.01
+        speed = max(0.0, 8.0 * (1.0 - math.cos(0.5 * t)))
+        demand = 9e3 * math.sin(0.5 * t) + 2e3 * math.sin(7.0 * t)
+        slip = 0.002 * demand / 1e3
+        return speed, [speed / 0.33 * (1.0 + slip * k) for k in (1.0, 1.1, 0.9, 1.0)], demand
+
+    def write(self, path: Path, count: int, *, state: bool = True, commands: bool = True, start: int = 0) -> Path:
+        """Drive `count` steps from step `start` on, starting the controller anew."""
+        wheel_states = JointStateEncoder(WHEEL_NAMES, "velocity")
+        torque, numbers = JointStateEncoder(WHEEL_NAMES, "effort"), JointStateEncoder(SIGNAL_NAMES, "position")
+        with BagWriter(path) as bag:
+            speed_topic = bag.add_topic(topic("/vehicle_speed", TWIST))
+            wheel_topic = bag.add_topic(topic("/wheel_states", JOINT_STATE))
+            battery_topic = bag.add_topic(topic("/battery_state", BATTERY))
+            demand_topic = bag.add_topic(topic("/power_demand"))
+            outputs = [bag.add_topic(topic(f"/{name}", JOINT_STATE)) for name in COMPUTED] if commands or state else []
+            for i in range(start, start + count):
+                now = (i + 1) * self.DT_NS
+                speed, wheels, demand = self.inputs(i)
+                log = now
+                for number, data in (
+                    (speed_topic, twist(now, speed)),
+                    (wheel_topic, wheel_states(now, wheels)),
+                    (battery_topic, battery(now, 0.7)),
+                    (demand_topic, float64(demand)),
+                ):
+                    bag.write(number, log, data, log, i + 1)
+                    log += 1000
+                monitor = self.controller.monitor
+                monitor.take_speed(SpeedReading(now, speed), now)
+                monitor.take_wheels(JointReading(now, WHEEL_NAMES, tuple(wheels)), now)
+                monitor.take_battery(BatteryReading(now, float(np.float32(0.7)), 25.0, math.nan, math.nan), now)
+                monitor.take_demand(demand, 0.0, now)
+                command, values = self.controller.step(now, 0.01)
+                for kind, data in (
+                    (0, torque(now, command.motor_torque_nm)),
+                    (1, torque(now, command.friction_torque_nm)),
+                    (2, numbers(now, values)),
+                ):
+                    if state if kind == 2 else commands:
+                        bag.write(outputs[kind], log, data, log, i + 1)
+                    log += 1000
+        return path
+
+
+def twist(stamp_ns: int, speed_mps: float) -> bytes:
+    """CDR of a TwistStamped."""
+    return b"\0\1\0\0" + struct.pack("<iII8x6d", stamp_ns // 10**9, stamp_ns % 10**9, 1, speed_mps, 0, 0, 0, 0, 0)
+
+
+def battery(stamp_ns: int, soc: float, temperature_c: float = 25.0) -> bytes:
+    """CDR of a BatteryState."""
+    types = typestore().types
+    stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+    empty = np.zeros(0, dtype=np.float32)
+    message = types[BATTERY](
+        header, 230.0, temperature_c, 0.0, math.nan, math.nan, math.nan, soc, 2, 0, 3, True, empty, empty, "", ""
+    )
+    return bytes(typestore().serialize_cdr(message, BATTERY))

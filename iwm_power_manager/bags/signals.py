@@ -19,6 +19,9 @@ from .reader import BagReader
 
 FloatArray = NDArray[np.float64]
 
+#: Signals that may be NaN in a good message: not measured.
+MAY_BE_UNKNOWN = frozenset({"battery_temperature"})
+
 
 class SignalValue(NamedTuple):
     """One value of one signal.
@@ -99,10 +102,12 @@ class SignalStream:
         except Exception:  # noqa: BLE001 - generated decoders raise whatever a damaged message makes them raise
             self.bad_messages += 1
             return []
-        if not all(math.isfinite(number) for value in values for number in value.values):
+        finite = [value for value in values if all(map(math.isfinite, value.values))]
+        # A battery without a thermometer says NaN, and means it.
+        if any(value.signal not in MAY_BE_UNKNOWN for value in values if value not in finite):
             self.bad_messages += 1
             return []
-        return values
+        return finite
 
     @staticmethod
     def _value(extractor: Extractor, message: Any, log_time_ns: int, publish_time_ns: int) -> SignalValue:

@@ -7,10 +7,10 @@ Three threads share the work: this module's main loop takes messages from DDS (`
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
 import re
 import signal
-import struct
 import sys
 import threading
 import time
@@ -51,7 +51,7 @@ from ..ros.messages import (
     ns_to_stamp,
 )
 from ..ros.parameters import Change, ParameterError, Spec, Value, declare
-from ..ros.raw import RawSubscriptions, Taken
+from ..ros.raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET, RawSubscriptions, Taken
 from ..ros.remote_parameters import RemoteParameters
 from ..share import resolve
 
@@ -76,8 +76,6 @@ _SETTLE_S = 0.2
 #: After the signal to end: taking goes on until nothing has come for the one, at most for the other.
 _FINAL_QUIET_S = 0.1
 _FINAL_WAIT_S = 2.0
-_CLOCK_FIELDS = struct.Struct("<iI")
-_CDR_HEAD_BYTES = 4
 
 
 def _spec(
@@ -251,8 +249,8 @@ class Recorder(Node):
         samples: list[Sample] = []
         for taken in batch:
             number, _, data, sent, sequence = taken
-            if number == self._clock_topic and len(data) >= _CDR_HEAD_BYTES + _CLOCK_FIELDS.size:
-                seconds, nanoseconds = _CLOCK_FIELDS.unpack_from(data, _CDR_HEAD_BYTES)
+            if number == self._clock_topic and len(data) >= CLOCK_FIELDS_OFFSET + CLOCK_FIELDS.size:
+                seconds, nanoseconds = CLOCK_FIELDS.unpack_from(data, CLOCK_FIELDS_OFFSET)
                 self._now_ns = max(seconds * 1_000_000_000 + nanoseconds, 0)
             if self._now_ns is None:
                 self._held.append(taken)
@@ -345,13 +343,21 @@ def _custom_data(values: Mapping[str, Any]) -> dict[str, str]:
         if values[f"{kind}_file"]:
             path = resolve(values[f"{kind}_file"])
             custom[f"{kind}_file"] = path.name
-            custom[f"{kind}_sha256"] = sha256_of(path)
+            custom[f"{kind}_sha256"] = _content_hash(path)
     for pair in filter(None, values["metadata"]):
         key, _, value = pair.partition("=")
         if not (key and value):
             raise ParameterError(f"parameter metadata: {pair!r} is not allowed; allowed: key=value")
         custom[key] = value
     return custom
+
+
+def _content_hash(path: Path) -> str:
+    """SHA-256 of a file; of a folder of policies, over the names and hashes of its files."""
+    if not path.is_dir():
+        return sha256_of(path)
+    files = sorted(file for file in path.iterdir() if file.is_file())
+    return hashlib.sha256("".join(f"{file.name} {sha256_of(file)}\n" for file in files).encode()).hexdigest()
 
 
 def _spin(executor: SingleThreadedExecutor) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import struct
 import time
 from collections.abc import Iterable, Sequence
 from operator import itemgetter
@@ -25,6 +26,10 @@ from ..bags.metadata import INFINITE_NS, Qos
 
 #: One message as it was taken: topic number, received (ns), bytes, sent (ns), the publisher's counter.
 Taken = tuple[int, int, bytes, int, int]
+
+#: A serialized `rosgraph_msgs/Clock`: seconds and nanoseconds behind the encapsulation.
+CLOCK_FIELDS = struct.Struct("<iI")
+CLOCK_FIELDS_OFFSET = 4
 
 #: Messages taken from one topic before the next has its turn, so that a flood on one cannot starve the others.
 _TURN = 5000

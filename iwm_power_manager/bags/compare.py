@@ -1,0 +1,142 @@
+"""Recomputed against recorded: how far apart, since when, by stamp."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import NamedTuple
+
+#: Stamps one side may be ahead of the other before they count as having no counterpart.
+_WINDOW = 10_000
+
+
+class Difference(NamedTuple):
+    """One value that differs.
+
+    Attributes
+    ----------
+    message : number of the compared message, from 0
+    stamp_ns, log_time_ns : of that message
+    name : of the value
+    recorded, recomputed : the values
+    """
+
+    message: int
+    stamp_ns: int
+    log_time_ns: int
+    name: str
+    recorded: float
+    recomputed: float
+
+
+class TopicComparison(NamedTuple):
+    """Result for one topic.
+
+    Attributes
+    ----------
+    topic : its name
+    compared : messages compared
+    differing : messages with at least one value beyond the tolerance
+    largest, rms : of all differences of values (infinite: one is NaN and the other is not)
+    worst : name of the value with the largest difference
+    first : first difference beyond the tolerance
+    only_recorded, only_recomputed : messages whose stamp the other side lacks
+    """
+
+    topic: str
+    compared: int
+    differing: int
+    largest: float
+    rms: float
+    worst: str
+    first: Difference | None
+    only_recorded: int
+    only_recomputed: int
+
+
+class TopicComparer:
+    """Pairs messages of one topic by stamp and compares their values, as they come.
+
+    Parameters
+    ----------
+    topic : its name
+    tolerance : largest absolute difference that is none
+    """
+
+    def __init__(self, topic: str, tolerance: float) -> None:
+        self._topic = topic
+        self._tolerance = tolerance
+        self._waiting: tuple[OrderedDict[int, _Side], OrderedDict[int, _Side]] = (OrderedDict(), OrderedDict())
+        self._unpaired = [0, 0]
+        self._compared = 0
+        self._differing = 0
+        self._count = 0
+        self._squares = 0.0
+        self._largest = 0.0
+        self._worst = ""
+        self._first: Difference | None = None
+
+    def recorded(self, stamp_ns: int, log_time_ns: int, names: Sequence[str], values: Sequence[float]) -> None:
+        """Add a recorded message."""
+        self._add(0, stamp_ns, _Side(log_time_ns, names, values))
+
+    def recomputed(self, stamp_ns: int, log_time_ns: int, names: Sequence[str], values: Sequence[float]) -> None:
+        """Add a recomputed message."""
+        self._add(1, stamp_ns, _Side(log_time_ns, names, values))
+
+    def result(self) -> TopicComparison:
+        """What has been found so far."""
+        return TopicComparison(
+            self._topic,
+            self._compared,
+            self._differing,
+            self._largest,
+            math.sqrt(self._squares / self._count) if self._count else 0.0,
+            self._worst,
+            self._first,
+            self._unpaired[0] + len(self._waiting[0]),
+            self._unpaired[1] + len(self._waiting[1]),
+        )
+
+    def _add(self, side: int, stamp_ns: int, new: _Side) -> None:
+        other = self._waiting[1 - side].pop(stamp_ns, None)
+        if other is not None:
+            self._compare(stamp_ns, *((new, other) if side == 0 else (other, new)))
+            return
+        waiting = self._waiting[side]
+        waiting[stamp_ns] = new
+        if len(waiting) > _WINDOW:
+            waiting.popitem(last=False)
+            self._unpaired[side] += 1
+
+    def _compare(self, stamp_ns: int, recorded: _Side, recomputed: _Side) -> None:
+        self._compared += 1
+        self._count += len(recomputed.values)
+        if recorded.names == recomputed.names and recorded.values == recomputed.values:
+            return  # NaN is not equal to itself, and goes the long way
+        found = dict(zip(recorded.names, recorded.values, strict=False))
+        beyond: Difference | None = None
+        for name, value in zip(recomputed.names, recomputed.values, strict=True):
+            was = found.get(name, math.nan)
+            difference = _distance(was, value)
+            self._squares += difference * difference
+            if difference > self._largest:
+                self._largest, self._worst = difference, name
+            if difference > self._tolerance and beyond is None:
+                beyond = Difference(self._compared - 1, stamp_ns, recorded.log_time_ns, name, was, value)
+        if beyond is not None:
+            self._differing += 1
+            self._first = self._first or beyond
+
+
+class _Side(NamedTuple):
+    log_time_ns: int
+    names: Sequence[str]
+    values: Sequence[float]
+
+
+def _distance(a: float, b: float) -> float:
+    if math.isnan(a) or math.isnan(b):
+        return 0.0 if math.isnan(a) and math.isnan(b) else math.inf
+    return abs(a - b) if a != b else 0.0

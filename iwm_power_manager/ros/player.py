@@ -1,0 +1,219 @@
+"""Play a bag to DDS, with /clock, so that the real nodes can be driven by a recorded drive.
+
+Time is the bag's: the log time, or, where a /clock was recorded, what that clock showed; so a lock-step drive, recorded
+much faster than real time, is played at the speed it was driven. The messages go out as the bytes they were recorded
+in, under the quality of service their publishers had offered.
+"""
+
+from __future__ import annotations
+
+import importlib
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+
+from ..bags.mapping import topic_named
+from ..bags.reader import BagReader, Message
+from ..bags.replay import COMPUTED
+from ..errors import BagError
+from .messages import CLOCK, clock_message
+from .raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET
+
+#: Not inputs: what nodes say about themselves.
+_NOT_PLAYED = ("/diagnostics", "/rosout", "/parameter_events", CLOCK)
+
+_TICK_NS = 10_000_000
+_NS_PER_S = 1_000_000_000
+_DEPTH = 1000
+#: Before the first message: until the listeners have stayed the same for the one, at most for the other.
+_SETTLE_S = 0.5
+_PATIENCE_S = 5.0
+_ACKNOWLEDGE_S = 2.0
+
+
+class PlayOptions(NamedTuple):
+    """How a bag is played.
+
+    Attributes
+    ----------
+    rate : times real time
+    step : wait for Enter before each 10 ms
+    start_s, end_s : part of the bag, from its begin; None for its end
+    loop : begin again at the end
+    topics : those to play; () for all but commands and reports
+    """
+
+    rate: float = 1.0
+    step: bool = False
+    start_s: float = 0.0
+    end_s: float | None = None
+    loop: bool = False
+    topics: tuple[str, ...] = ()
+
+
+def play(bag: BagReader, options: PlayOptions) -> int:
+    """Play until the end, or until Ctrl-C or SIGTERM; returns the exit code.
+
+    Raises
+    ------
+    BagError
+        Nothing can be played: a topic or a message type is missing.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("replay", enable_rosout=False, start_parameter_services=False)
+    try:
+        player = _Player(node, bag, options, stop)
+        player.wait_for_listeners()
+        while player.pass_once() and options.loop and not stop.is_set():
+            pass
+        player.finish()
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+class _Player:
+    def __init__(self, node: Node, bag: BagReader, options: PlayOptions, stop: threading.Event) -> None:
+        self._bag = bag
+        self._options = options
+        self._stop = stop
+        self._publishers = {name: _publisher(node, bag, name) for name in _chosen(bag, options.topics)}
+        self._clock = node.create_publisher(Clock, CLOCK, QoSProfile(depth=_DEPTH))
+        self._sent = 0
+        self._late_s = 0.0
+
+    def wait_for_listeners(self) -> None:
+        """Wait until somebody listens and no more listeners appear."""
+        deadline = time.monotonic() + _PATIENCE_S
+        count, since = -1, time.monotonic()
+        while time.monotonic() < deadline and not self._stop.wait(0.02):
+            now = sum(publisher.get_subscription_count() for publisher in self._publishers.values())
+            if now != count:
+                count, since = now, time.monotonic()
+            elif count and time.monotonic() - since > _SETTLE_S:
+                return
+        if not count and not self._stop.is_set():
+            print("replay: nobody listens; playing all the same", file=sys.stderr)
+
+    def pass_once(self) -> bool:
+        """Play the chosen part once; False if there was nothing in it."""
+        begin_ns: int | None = None
+        first_ns = next_tick_ns = 0
+        started_s = 0.0
+        before = self._sent
+        for time_ns, message in _timeline(self._bag):
+            if begin_ns is None:
+                begin_ns = time_ns
+            offset_s = (time_ns - begin_ns) / _NS_PER_S
+            if offset_s < self._options.start_s:
+                continue
+            if self._options.end_s is not None and offset_s > self._options.end_s:
+                break
+            if not first_ns:
+                first_ns = next_tick_ns = time_ns
+                started_s = time.monotonic()
+            while next_tick_ns <= time_ns:
+                if not self._reach(next_tick_ns, first_ns, started_s, ticks=True):
+                    return False
+                next_tick_ns += _TICK_NS
+            if not self._reach(time_ns, first_ns, started_s, ticks=False):
+                return False
+            publisher = self._publishers.get(message.topic)
+            if publisher is not None:
+                publisher.publish(message.data)
+                self._sent += 1
+        if self._sent == before:
+            raise BagError(f"{self._bag.path}: holds no message to play between --start and --end")
+        return True
+
+    def finish(self) -> None:
+        """Wait until listeners have everything, and say what was sent."""
+        for publisher in self._publishers.values():
+            publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
+        print(f"{self._bag.path}: {self._sent} messages of {len(self._publishers)} topics published")
+        for line in self._bag.damage:
+            print(f"  damaged: {line}")
+
+    def _reach(self, time_ns: int, first_ns: int, started_s: float, *, ticks: bool) -> bool:
+        """Let time come to `time_ns` and tell it; False if it is to stop."""
+        if self._options.step:
+            if ticks and not sys.stdin.readline():
+                self._stop.set()
+        else:
+            wait_s = started_s + (time_ns - first_ns) / _NS_PER_S / self._options.rate - time.monotonic()
+            if wait_s > 0.0:
+                self._stop.wait(wait_s)
+        if self._stop.is_set():
+            return False
+        self._clock.publish(clock_message(time_ns))
+        return True
+
+
+def _chosen(bag: BagReader, topics: tuple[str, ...]) -> list[str]:
+    if not topics:
+        commands = {topic_named(kind, bag.topics) for kind in COMPUTED}
+        return [name for name in bag.topics if name not in commands and name not in _NOT_PLAYED]
+    names = []
+    for wanted in topics:
+        name = topic_named(wanted, bag.topics)
+        if name is None:
+            raise BagError(f"{bag.path}: holds no topic {wanted}; it holds {', '.join(sorted(bag.topics))}")
+        names.append(name)
+    return names
+
+
+def _publisher(node: Node, bag: BagReader, name: str) -> Any:
+    topic = bag.topics[name]
+    package, _, rest = topic.type.partition("/")
+    kind, _, message = rest.partition("/")
+    try:
+        msg_class = getattr(importlib.import_module(f"{package}.{kind}"), message)
+    except (ImportError, AttributeError):
+        raise BagError(f"{name}: type {topic.type} is not installed here; choose others with --topics") from None
+    reliable = not topic.qos or any(profile.reliability != "best_effort" for profile in topic.qos)
+    latched = any(profile.durability == "transient_local" for profile in topic.qos)
+    profile = QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=_DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+    return node.create_publisher(msg_class, name, profile)
+
+
+def _timeline(bag: BagReader) -> Iterator[tuple[int, Message]]:
+    """The bag's messages with the time of each: of the recorded clock, if there is one, else of the recording."""
+    clocked = CLOCK in bag.topics and (not bag.counts or bag.counts.get(CLOCK, 0) > 0)
+    if not clocked:
+        for message in bag.messages():
+            yield message.log_time_ns, message
+        return
+    waiting: list[Message] = []
+    now_ns: int | None = None
+    for message in bag.messages():
+        if message.topic == CLOCK:
+            seconds, nanoseconds = CLOCK_FIELDS.unpack_from(message.data, CLOCK_FIELDS_OFFSET)
+            now_ns = seconds * _NS_PER_S + nanoseconds
+            for early in waiting:
+                yield now_ns, early
+            waiting = []
+        elif now_ns is None:
+            waiting.append(message)
+        else:
+            yield now_ns, message
+    for early in waiting:
+        yield early.log_time_ns, early

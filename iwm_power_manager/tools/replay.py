@@ -1,0 +1,290 @@
+"""Command `replay`: the control law over a recorded drive, compared, published, or asked "what if".
+
+Exit codes: 0 done; 1 recomputed and recorded commands differ beyond the tolerance; 2 bad arguments or files;
+130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from .. import __version__
+from ..bags.mapping import SignalMapping, load_mapping
+from ..bags.plan import Choice, Plan, make_plan
+from ..bags.reader import BagReader
+from ..bags.replay import Replay, ReplayOutput, ReplayReport, exceeds
+from ..bags.what_if import Consumption, strategy_name, what_if
+from ..bags.writer import BagWriter, WriterOptions
+from ..control.types import STRATEGIES
+from ..errors import ConfigError, IwmError
+from ..files import atomic_write, check_number
+from ..share import resolve
+
+DONE, DIFFERENT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+_DESCRIPTION = """\
+Run the control law over a recorded drive, without DDS and without a clock: the same bag gives the same bytes every
+time. Any rosbag2 recording will do, MCAP or sqlite3; other cars' topics and units are mapped by a YAML file.
+"""
+
+_EXAMPLES = """\
+examples:
+  Is the law still the one that was recorded? Exit code 1 if not.
+    replay drive_01 --compare
+  A new bag with the same inputs and the commands of another policy:
+    replay drive_01 --policy policies/new.npz --strategy sdp --output drive_01_new
+  What would equal split have consumed?
+    replay drive_01 --what-if jalalmaab_2015 --strategy equal sdp
+  Drive the real node with it, at half speed:
+    replay drive_01 --publish --rate 0.5
+"""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    options = _parser().parse_args(args)
+    try:
+        _check(options)
+        if options.publish:
+            return _publish(options)
+        with BagReader(options.bag) as bag:
+            mapping = load_mapping(resolve(options.mapping) if options.mapping else None)
+            return _what_if(bag, mapping, options) if options.what_if else _replay(bag, mapping, options)
+    except IwmError as error:
+        print(f"replay: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read our output has had enough
+        return DONE
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="replay",
+        description=_DESCRIPTION,
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    strategies = ", ".join(name for name in STRATEGIES if name != "preview")
+    parser.add_argument("bag", metavar="BAG", help="folder of the bag, or one .mcap or .db3 file")
+    parser.add_argument("--version", action="version", version=f"replay {__version__}")
+    law = parser.add_argument_group("the law; what is not given comes from the bag, else from the package")
+    law.add_argument("--vehicle", metavar="YAML", help="the car")
+    law.add_argument("--policy", metavar="FILE", help="policy file, or folder of policies over friction")
+    law.add_argument("--strategy", metavar="NAME", nargs="+", help=strategies)
+    law.add_argument("--friction", type=float, metavar="MU", help="peak friction the strategy assumes")
+    law.add_argument("--set", dest="settings", metavar="NAME=VALUE", action="append", default=[], help="a setting")
+    law.add_argument("--mapping", metavar="YAML", help="topics, fields and units of another car's bag (config/bags/)")
+    out = parser.add_argument_group("results")
+    out.add_argument("--output", metavar="DIR", help="write a bag: inputs as recorded, commands recomputed")
+    out.add_argument("--compare", action="store_true", help="recomputed against recorded; exit code 1 if they differ")
+    out.add_argument("--tolerance", type=float, default=0.0, metavar="X", help="difference that is none (default 0)")
+    out.add_argument("--what-if", metavar="YAML", help="energy this car would have taken, for each --strategy")
+    out.add_argument("--json", metavar="FILE", help="write the result as JSON; - for standard output")
+    out.add_argument("--quiet", action="store_true", help="no progress bar")
+    play = parser.add_argument_group("publishing")
+    play.add_argument("--publish", action="store_true", help="publish the inputs and /clock instead of computing")
+    play.add_argument("--rate", type=float, default=1.0, metavar="X", help="times real time (default 1)")
+    play.add_argument("--step", action="store_true", help="go on by 10 ms at each Enter")
+    play.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds into the bag to begin at")
+    play.add_argument("--end", type=float, metavar="S", help="seconds into the bag to end at")
+    play.add_argument("--loop", action="store_true", help="begin again at the end")
+    play.add_argument("--topics", nargs="+", metavar="TOPIC", help="publish these only; default: all but the commands")
+    return parser
+
+
+def _check(options: argparse.Namespace) -> None:
+    if options.publish and (options.output or options.compare or options.what_if):
+        raise ConfigError("arguments", "--publish", "excludes --output, --compare and --what-if")
+    if options.what_if and (options.output or options.compare or options.vehicle):
+        raise ConfigError("arguments", "--what-if", "excludes --output, --compare and --vehicle")
+    if not options.what_if and len(options.strategy or []) > 1:
+        raise ConfigError("arguments", "--strategy", "several make sense with --what-if only")
+    check_number("arguments", "--tolerance", options.tolerance, 0.0)
+    check_number("arguments", "--rate", options.rate, 0.001, 1000.0)
+    check_number("arguments", "--start", options.start, 0.0)
+    if options.end is not None:
+        check_number("arguments", "--end", options.end, options.start, above=True)
+    if options.friction is not None:
+        check_number("arguments", "--friction", options.friction, 0.05, 1.5)
+
+
+def _plan(bag: BagReader, options: argparse.Namespace, vehicle: str | None, strategy: str | None) -> Plan:
+    choice = Choice(vehicle, options.policy, strategy, options.friction, options.settings)
+    return make_plan(choice, bag.custom_data)
+
+
+def _replay(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace) -> int:
+    plan = _plan(bag, options, options.vehicle, options.strategy[0] if options.strategy else None)
+    replay = Replay(bag, plan, mapping, options.tolerance)
+    started_s = time.perf_counter()
+    writer = None
+    if options.output:
+        writer = BagWriter(options.output, WriterOptions(), _custom_data(bag, plan))
+    try:
+        output = ReplayOutput(writer, bag, plan) if writer is not None else None
+        with _progress(bag, options, 1) as progress:
+            for message, steps in replay.steps(progress):
+                if output is not None:
+                    output.write(message, steps)
+    finally:
+        if writer is not None:
+            writer.close()
+    report = replay.report()
+    elapsed_s = time.perf_counter() - started_s
+    result = _result(bag, plan, report)
+    lines = _report_lines(bag, report, elapsed_s)
+    if writer is not None:
+        lines.append(f"written: {writer.path}, {writer.message_count} messages")
+    if options.compare:
+        lines += _comparison_lines(report)
+    _show(lines, result, options)
+    if not report.steps:
+        raise ConfigError(bag.path, "", "gave no control step: speed, wheel speeds and demand never came together")
+    return DIFFERENT if options.compare and exceeds(report.comparison, options.tolerance) else DONE
+
+
+def _what_if(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace) -> int:
+    names = options.strategy or ["equal", strategy_name(_plan(bag, options, options.what_if, None).settings.strategy)]
+    plans = [(name, _plan(bag, options, options.what_if, name)) for name in dict.fromkeys(names)]
+    with _progress(bag, options, len(plans)) as progress:
+        rows = what_if(bag, plans, mapping, progress)
+    lines = [
+        f"{bag.path}: open-loop estimate for {plans[0][1].vehicle.name}, idle drive {plans[0][1].vehicle.idle_drive}",
+        f"  {'':20} {'Wh':>9} {'Wh/km':>8} {'at wheels':>10} {'brakes':>8} {'idle drag':>9} {'saving':>8}",
+        *(_consumption_line(row, rows[0]) for row in rows),
+        "  speed, wheel speeds and demand stay as recorded: it tells losses, not how slip or the driver would differ",
+    ]
+    _show(lines, {"bag": str(bag.path), "rows": [row._asdict() for row in rows], "damage": bag.damage}, options)
+    return DONE
+
+
+def _consumption_line(row: Consumption, reference: Consumption) -> str:
+    saving = 100.0 * (1.0 - row.chemical_wh / reference.chemical_wh) if reference.chemical_wh else float("nan")
+    return (
+        f"  {row.label:20} {row.chemical_wh:9.2f} {row.wh_per_km:8.2f} {row.wheel_work_wh:10.2f} "
+        f"{row.friction_wh:8.2f} {row.idle_drag_wh:9.2f} {saving:7.2f}%"
+    )
+
+
+def _publish(options: argparse.Namespace) -> int:
+    from ..ros.player import PlayOptions, play
+
+    with BagReader(options.bag) as bag:
+        return play(
+            bag,
+            PlayOptions(
+                options.rate, options.step, options.start, options.end, options.loop, tuple(options.topics or ())
+            ),
+        )
+
+
+def _custom_data(bag: BagReader, plan: Plan) -> dict[str, str]:
+    """What the new bag says about its making; no time and no path, so that the same replay gives the same bytes."""
+    return {
+        **bag.custom_data,
+        "package_version": __version__,
+        "replay_of": bag.path.name,
+        "replay_vehicle_hash": plan.vehicle.hash,
+        "replay_strategy": strategy_name(plan.settings.strategy),
+        "replay_changes": json.dumps(plan.changes, sort_keys=True),
+    }
+
+
+def _result(bag: BagReader, plan: Plan, report: ReplayReport) -> dict[str, Any]:
+    return {
+        "bag": str(bag.path),
+        "vehicle": plan.vehicle.name,
+        "vehicle_hash": plan.vehicle.hash,
+        "policies": plan.policies.checksums,
+        **report._asdict(),
+        "comparison": [
+            {**topic._asdict(), "first": topic.first._asdict() if topic.first else None} for topic in report.comparison
+        ],
+    }
+
+
+def _report_lines(bag: BagReader, report: ReplayReport, elapsed_s: float) -> list[str]:
+    span_s = (report.last_stamp_ns - report.first_stamp_ns) * 1e-9
+    how = "repeated from the recorded state" if report.exact else "made from the recorded inputs"
+    lines = [
+        f"{bag.path}: {report.messages} messages, {report.steps} steps over {span_s:.2f} s, {how}, "
+        f"in {elapsed_s:.2f} s ({report.messages / max(elapsed_s, 1e-9):.0f} messages/s)"
+    ]
+    if report.gaps:
+        lines.append(f"  {report.gaps} time(s) steps before are not in the bag: the law's memory there is unknown")
+    if report.restarts:
+        lines.append(f"  {report.restarts} pause(s) or jump(s) back in the inputs: the law started anew")
+    if report.bad_messages:
+        lines.append(f"  {report.bad_messages} bad messages skipped")
+    for topic, reasons in report.dropped.items():
+        lines.append(f"  {topic}: not believed: " + ", ".join(f"{count} {name}" for name, count in reasons.items()))
+    for reason, count in report.faults.items():
+        lines.append(f"  {count} step(s) without a command: {reason}")
+    return lines + [f"  damaged: {line}" for line in report.damage]
+
+
+def _comparison_lines(report: ReplayReport) -> list[str]:
+    lines = [f"  {'topic':32} {'compared':>9} {'differ':>8} {'largest':>11} {'rms':>11}"]
+    for topic in report.comparison:
+        lines.append(
+            f"  {topic.topic:32} {topic.compared:9} {topic.differing:8} {topic.largest:11.4g} {topic.rms:11.4g}"
+            + (f"  {topic.worst}" if topic.worst else "")
+        )
+        if topic.only_recorded or topic.only_recomputed:
+            lines.append(f"    without counterpart: {topic.only_recorded} recorded, {topic.only_recomputed} recomputed")
+        if topic.first is not None:
+            first = topic.first
+            lines.append(
+                f"    first at message {first.message}, stamp {first.stamp_ns * 1e-9:.9f} s: {first.name} "
+                f"recorded {first.recorded!r}, recomputed {first.recomputed!r}"
+            )
+    if not any(topic.compared for topic in report.comparison):
+        lines.append("  nothing to compare: the bag holds no command of this project")
+    return lines
+
+
+def _show(lines: list[str], result: dict[str, Any], options: argparse.Namespace) -> None:
+    text = json.dumps(result, indent=1, default=list)
+    if options.json == "-":
+        print(text)
+        return
+    print("\n".join(lines))
+    if options.json:
+        atomic_write(Path(options.json), (text + "\n").encode())
+
+
+@contextmanager
+def _progress(bag: BagReader, options: argparse.Namespace, passes: int) -> Iterator[Callable[[int, int], None] | None]:
+    """Progress by the recorded time, because a damaged bag does not know its number of messages."""
+    if options.quiet or not sys.stderr.isatty():
+        yield None
+        return
+    span_s = max((bag.end_ns - bag.start_ns) * 1e-9, 1e-9)
+    with tqdm(total=round(passes * span_s, 1), unit="s", desc=bag.path.name, leave=False) as bar:
+        done_s = 0.0
+        last = 0
+
+        def show(messages: int, log_time_ns: int) -> None:
+            nonlocal done_s, last
+            if messages < last:
+                done_s += span_s
+            last = messages
+            bar.update(done_s + (log_time_ns - bag.start_ns) * 1e-9 - bar.n)
+
+        yield show
+
+
+if __name__ == "__main__":
+    sys.exit(main())
