@@ -50,9 +50,8 @@ class ScriptedDrive:
     def __init__(self, settings: Settings | None = None, strategy: str = "instantaneous_slip") -> None:
         self.vehicle = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"))
         self.settings = settings or default_settings(strategy)
-        limits = ControllerLimits(
-            steps._INPUT_LIMITS._replace(radius_m=0.33), None, SupervisionLimits(0.3, 2, 0.5, 0.5)
-        )
+        supervision = SupervisionLimits(0.3, 2.0, 0.5, 0.5)
+        limits = ControllerLimits(steps.INPUT_LIMITS._replace(radius_m=0.33), None, supervision)
         self.controller = Controller(self.vehicle.params, WHEEL_NAMES, limits, self.settings, empty_table(), 0.9)
 
     def inputs(self, i: int) -> tuple[float, list[float], float]:
@@ -104,7 +103,7 @@ class ScriptedDrive:
 
 def twist(stamp_ns: int, speed_mps: float) -> bytes:
     """CDR of a TwistStamped."""
-    return b"\0\1\0\0" + struct.pack("<iII8x6d", stamp_ns // 10**9, stamp_ns % 10**9, 1, speed_mps, 0, 0, 0, 0, 0)
+    return b"\0\1\0\0" + struct.pack("<iII4x6d", stamp_ns // 10**9, stamp_ns % 10**9, 1, speed_mps, 0, 0, 0, 0, 0)
 
 
 def battery(stamp_ns: int, soc: float, temperature_c: float = 25.0) -> bytes:

@@ -1,4 +1,4 @@
-"""With what a bag is replayed: the car, the policies, the law's settings. From the options, else from the bag itself."""
+"""With what a bag is replayed: car, policies, settings of the law. From the options, else from the bag itself."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ _PAUSE_S = 1.0
 _PROBE_VALUES = 400
 
 #: What recorded inputs are judged by: finite, and physically possible. Stamps are not judged: there is no clock here.
-_INPUT_LIMITS = InputLimits(
+INPUT_LIMITS = InputLimits(
     stamp=None,
     demand_delay_s=_INF,
     speed=ValueLimits(-1.0, 150.0, 100.0, 100.0, 1.0),
@@ -174,7 +174,7 @@ class ReconstructedSteps:
         self._queue = lockstep.LockstepQueue()
         vehicle = plan.vehicle.params
         limits = ControllerLimits(
-            _INPUT_LIMITS._replace(radius_m=vehicle.wheel.radius_m), None, SupervisionLimits(0.3, 2.0, 0.5, 0.5)
+            INPUT_LIMITS._replace(radius_m=vehicle.wheel.radius_m), None, SupervisionLimits(0.3, 2.0, 0.5, 0.5)
         )
         table = plan.policies.table(plan.settings.strategy, plan.friction)
         self._controller = Controller(vehicle, WHEEL_NAMES, limits, plan.settings, table, plan.friction)
@@ -357,4 +357,5 @@ def _in_sets(probe: Iterable[SignalValue]) -> bool:
 
 
 _FIRST_DECIDED = SIGNAL_NAMES.index("front_left_motor_torque_nm")
-DECIDED_NAMES = SIGNAL_NAMES[_FIRST_DECIDED : SIGNAL_NAMES.index("rear_heat") + 1]
+#: The signals of `control.record` that the law decides.
+DECIDED_NAMES = tuple(SIGNAL_NAMES[_FIRST_DECIDED : SIGNAL_NAMES.index("rear_heat") + 1])
