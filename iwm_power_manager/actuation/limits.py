@@ -23,12 +23,13 @@ def battery_limits_w(soc: float, temperature_degc: float, battery: Battery) -> t
     -------
     discharge limit, charge limit
     """
-    discharge = battery.discharge_limit_w * fade(soc, battery.discharge_zero_below_soc, battery.discharge_full_above_soc)
-    charge = battery.charge_limit_w * fade(soc, battery.charge_zero_above_soc, battery.charge_full_below_soc)
+    b = battery
+    discharge = b.discharge_limit_w * fade(soc, b.discharge_zero_below_soc, b.discharge_full_above_soc)
+    charge = b.charge_limit_w * fade(soc, b.charge_zero_above_soc, b.charge_full_below_soc)
     if temperature_degc == temperature_degc:
-        hot = fade(temperature_degc, battery.power_zero_above_degc, battery.power_full_below_degc)
+        hot = fade(temperature_degc, b.power_zero_above_degc, b.power_full_below_degc)
         discharge *= hot
-        charge *= hot * fade(temperature_degc, battery.charge_zero_below_degc, battery.charge_full_above_degc)
+        charge *= hot * fade(temperature_degc, b.charge_zero_below_degc, b.charge_full_above_degc)
     return discharge, charge
 
 
@@ -54,11 +55,13 @@ def battery_scale(
 ) -> float:
     """Largest factor 0..1 on the motor torques that keeps the battery inside its limits (eq. 24, 43).
 
-    Where even standby or losses at zero torque are too much, the factor is 0: torque cannot help then.
+    Where even standby or losses at zero torque are too much, the factor is 0: torque cannot help then. So it is where
+    both limits are 0: that switches the motors off.
     """
     power = car_power_w(front_torque_nm, rear_torque_nm, front_speed_radps, rear_speed_radps, motor)
     if -charge_limit_w <= power <= discharge_limit_w:
         return 1.0
+    charging = power < -charge_limit_w
     low = 0.0
     high = 1.0
     for _ in range(40):
@@ -66,8 +69,11 @@ def battery_scale(
         power = car_power_w(
             middle * front_torque_nm, middle * rear_torque_nm, front_speed_radps, rear_speed_radps, motor
         )
-        if -charge_limit_w <= power <= discharge_limit_w:
+        # Only the side that was violated: the losses of a weak regeneration, which an empty battery cannot cover, must
+        # not hide the stronger one that covers them.
+        if (power >= -charge_limit_w) if charging else (power <= discharge_limit_w):
             low = middle
         else:
             high = middle
-    return low
+    power = car_power_w(low * front_torque_nm, low * rear_torque_nm, front_speed_radps, rear_speed_radps, motor)
+    return low if -charge_limit_w <= power <= discharge_limit_w else 0.0

@@ -18,7 +18,7 @@ Steps 3 to 5 and 7 only ever make a motor torque smaller at once: no rate limit 
 from __future__ import annotations
 
 from iwm_power_manager.actuation.gate import axle_gated, gated_split
-from iwm_power_manager.actuation.limits import battery_scale
+from iwm_power_manager.actuation.limits import battery_scale, car_power_w
 from iwm_power_manager.actuation.torque import allocate, blend, conversion_speed_radps
 from iwm_power_manager.control.slew import approached, slewed
 from iwm_power_manager.control.slip import UNLIMITED_NM, axle_slip, filtered, road_torque_nm, torque_room_nm
@@ -47,6 +47,9 @@ from iwm_power_manager.vehicle import VehicleParams
 #: A motor torque below this is rounding noise of a share or a fade; zero lets the drive go idle.
 ZERO_TORQUE_NM = 1e-6
 
+#: Part of the demand that sums and differences of powers may lose without a limit having bitten.
+ROUNDING = 1e-12
+
 
 @kernel
 def _inside(
@@ -74,6 +77,15 @@ def _inside(
 @kernel
 def _quiet(torque_nm: float) -> float:
     return torque_nm if abs(torque_nm) > ZERO_TORQUE_NM else 0.0
+
+
+@kernel
+def _friction(total_nm: float, motor_nm: float, most_nm: float) -> float:
+    """Friction torque that makes up, with what the motor does, the braking torque asked for.
+
+    A motor that is still on its way down from driving is held against: braking gets through at once.
+    """
+    return max(min(total_nm - motor_nm, 0.0), -most_nm)
 
 
 @kernel
@@ -187,11 +199,11 @@ def step(
     sign = -1.0 if braking else 1.0
     front_total = sign * front_given / (2.0 * front_conversion)
     rear_total = sign * rear_given / (2.0 * rear_conversion)
-    for asked, given, room, grip, fast, heat in (
-        (front_asked, front_given, front_room, front_grip, front_fast, state.front_heat),
-        (rear_asked, rear_given, rear_room, rear_grip, rear_fast, state.rear_heat),
+    for asked, given, room, grip, fast in (
+        (front_asked, front_given, front_room, front_grip, front_fast),
+        (rear_asked, rear_given, rear_room, rear_grip, rear_fast),
     ):
-        if given < asked * (1.0 - 1e-12):
+        if asked - given > ROUNDING * abs(demand):
             if grip < room:
                 limits |= LIMIT_SLIP
             elif braking:
@@ -213,7 +225,7 @@ def step(
     rear_slewed = slewed(state.rear_motor_nm, rear_motor, dt, up, down, growth)
     front_slewed = _inside(front_slewed, front_gated, braking, front_grip, front_fast, speed, state.front_heat, vehicle)
     rear_slewed = _inside(rear_slewed, rear_gated, braking, rear_grip, rear_fast, speed, state.rear_heat, vehicle)
-    if front_slewed != front_motor or rear_slewed != rear_motor:
+    if max(abs(front_slewed - front_motor), abs(rear_slewed - rear_motor)) > ZERO_TORQUE_NM:
         limits |= LIMIT_SLEW
 
     # 7. battery
@@ -227,12 +239,14 @@ def step(
         vehicle.motor,
     )
     if scale < 1.0:
-        limits |= LIMIT_BATTERY_CHARGE if front_slewed + rear_slewed < 0.0 else LIMIT_BATTERY_DISCHARGE
+        power = car_power_w(front_slewed, rear_slewed, front_speed, rear_speed, vehicle.motor)
+        limits |= LIMIT_BATTERY_CHARGE if power < 0.0 else LIMIT_BATTERY_DISCHARGE
     front_motor = _quiet(scale * front_slewed)
     rear_motor = _quiet(scale * rear_slewed)
     if braking:
-        front_friction = min(front_total - min(front_motor, 0.0), 0.0)
-        rear_friction = min(rear_total - min(rear_motor, 0.0), 0.0)
+        most = vehicle.friction_brake.max_torque_nm
+        front_friction = _friction(front_total, front_motor, most)
+        rear_friction = _friction(rear_total, rear_motor, most)
 
     command = Command(
         (front_motor, front_motor, rear_motor, rear_motor),
