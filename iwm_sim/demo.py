@@ -47,6 +47,8 @@ from iwm_sim.study.report import write_page
 _DOMAINS = range(1, 102)
 #: A node that has to compile first, on a busy machine, takes this long to be there.
 _PARTNER_TIMEOUT_S = 300.0
+#: What the simulator sends at its rate, which the power manager has to know to notice when it is missing.
+_PERIODIC_INPUTS = ("vehicle_speed", "wheel_states", "power_demand")
 _REFERENCE = "equal"
 _LOCK_STEP = "three processes over DDS, lock-step"
 _REAL_TIME = "three processes over DDS, real time"
@@ -117,7 +119,7 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
     parser.add_argument(
         "--idle-drive", default="", choices=["", *IDLE_DRIVES], help="replaces the vehicle's idle_drive; '': as it is"
     )
-    parser.add_argument("--rate", default=100.0, type=_number(10.0, 1000.0), help="control rate, Hz")
+    parser.add_argument("--rate", default=50.0, type=_number(10.0, 1000.0), help="control rate, Hz")
     parser.add_argument("--soc", default=0.8, type=_number(0.0, 1.0), help="state of charge at the start, 0..1")
     parser.add_argument("--until", default=0.0, type=_number(0.0, 1e6), help="drive only so much of it, s; 0: all")
     parser.add_argument("--realtime", action="store_true", help="in real time instead of lock-step")
@@ -157,7 +159,8 @@ def _number(low: float, high: float) -> Any:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; returns the exit code."""
     plan = parse(arguments)
-    signal.signal(signal.SIGTERM, _terminated)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _terminated)
     try:
         return run(plan)
     except KeyboardInterrupt:
@@ -311,7 +314,15 @@ def drive_over_dds(plan: Plan, loaded: Loaded) -> Outcome:
             )
         power_manager = children.start(
             "power manager",
-            node_command("power_manager", {**common, "strategy": plan.strategy, "policy_file": _absolute(plan.policy)}),
+            node_command(
+                "power_manager",
+                {
+                    **common,
+                    "strategy": plan.strategy,
+                    "policy_file": _absolute(plan.policy),
+                    **{f"input_period_s.{topic}": 1.0 / plan.rate_hz for topic in _PERIODIC_INPUTS},
+                },
+            ),
         )
         simulator = children.start(
             "simulator",
@@ -353,7 +364,7 @@ def check_bag(plan: Plan, driven: Run, notes: dict[str, Any], path: Path) -> Out
     total = sum(bag.counts.values())
     remark = f"The bag holds {total} messages on {len(bag.counts)} topics: "
     remark += f"incomplete: {'; '.join(lines)}." if lines else "all that were published."
-    return Outcome(with_decisions(driven, bag, stamps), notes, [remark], not lines)
+    return Outcome(with_decisions(driven, bag), notes, [remark], not lines)
 
 
 def _policy_file(plan: Plan) -> dict[str, str]:

@@ -16,6 +16,7 @@ from iwm_power_manager.errors import BagError
 from iwm_sim.closed_loop import COLUMNS, Run
 from iwm_sim.drive import LAW_COLUMNS
 
+SPEED = "vehicle_speed"
 STATE = "power_manager/state"
 COMMANDS = ("wheel_torque_command", "friction_brake_command")
 
@@ -31,7 +32,7 @@ class DriveBag(NamedTuple):
     Attributes
     ----------
     counts : messages by topic, without a leading slash
-    stamps_ns : stamps of the commands and of the state by topic, in order
+    stamps_ns : stamps of speed, commands and state by topic, in order
     decisions : (steps, len(LAW_COLUMNS)) what the law decided, a row for each state message
     """
 
@@ -49,7 +50,7 @@ def read_drive_bag(path: Path) -> DriveBag:
         It cannot be read, is damaged, or its state messages lack a signal.
     """
     counts: Counter[str] = Counter()
-    stamps: dict[str, list[int]] = {topic: [] for topic in (*COMMANDS, STATE)}
+    stamps: dict[str, list[int]] = {topic: [] for topic in (SPEED, *COMMANDS, STATE)}
     decisions = []
     signals = np.zeros(0, dtype=np.intp)
     size = 0
@@ -90,12 +91,12 @@ def problems(bag: DriveBag, published: Mapping[str, int], stamps_ns: list[int]) 
     return lines
 
 
-def with_decisions(run: Run, bag: DriveBag, stamps_ns: list[int]) -> Run:
+def with_decisions(run: Run, bag: DriveBag) -> Run:
     """The run with what the law had decided by the stamp of each step; before the first state that is nothing (NaN)."""
-    at = (
-        np.searchsorted(np.array(bag.stamps_ns[STATE], dtype=np.int64), np.array(stamps_ns, dtype=np.int64), "right")
-        - 1
-    )
+    steps = np.unique(np.array(bag.stamps_ns[SPEED], dtype=np.int64))
+    if len(steps) != len(run.series):
+        return run
+    at = np.searchsorted(np.array(bag.stamps_ns[STATE], dtype=np.int64), steps, "right") - 1
     series = run.series.copy()
     known = at >= 0
     for column, name in enumerate(LAW_COLUMNS):

@@ -91,6 +91,10 @@ class Pacer:
     period_s : simulated time of one step
     speed_factor : simulated seconds per second
     catch_up : most steps taken at once
+
+    Attributes
+    ----------
+    stalls, late_s : long stalls, and how late simulated time is for good because of them, wall s
     """
 
     def __init__(self, period_s: float, speed_factor: float, catch_up: int = 5) -> None:
@@ -99,6 +103,7 @@ class Pacer:
         self._start_s = 0.0
         self._taken = 0
         self.stalls = 0
+        self.late_s = 0.0
 
     def start(self, now_s: float) -> None:
         """Begin: the first step is due one period from now."""
@@ -108,10 +113,10 @@ class Pacer:
     def due(self, now_s: float) -> int:
         """Steps to take now; they count as taken."""
         # A timer that fires a hair early must not lose its step.
-        steps = int((now_s - self._start_s) / self.wall_period_s + 0.01) - self._taken
+        steps = int((now_s - self._start_s - self.late_s) / self.wall_period_s + 0.01) - self._taken
         if steps > self._catch_up:
             self.stalls += 1
-            self._start_s += (steps - self._catch_up) * self.wall_period_s
+            self.late_s += (steps - self._catch_up) * self.wall_period_s
             steps = self._catch_up
         steps = max(steps, 0)
         self._taken += steps

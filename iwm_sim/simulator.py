@@ -217,15 +217,15 @@ class Simulator(Node):
         if math.isinf(self._partners_since_s):
             self._partners_since_s = now
         if now - self._partners_since_s >= _SETTLE_S:
-            self._begin(now)
+            self._begin()
 
-    def _begin(self, now: float) -> None:
+    def _begin(self) -> None:
         self.destroy_timer(self._timer)
         # What exists now lives to the end; without it, a collection takes no noticeable time.
         gc.collect()
         gc.freeze()
         self._phase = _Phase.DRIVING
-        self._begun_s = now
+        self._begun_s = time.monotonic()
         self._first_stamp_ns = self._period_ns if self._simulated_time else self.get_clock().now().nanoseconds
         self.get_logger().info("driving")
         self._intake.drop_all()
@@ -233,7 +233,7 @@ class Simulator(Node):
             self._timer = self.create_timer(_POLL_S, self._look_for_answer, clock=self._wall)
             self._ask()
         else:
-            self._pacer.start(now)
+            self._pacer.start(self._begun_s)
             self._publish_set()
             self._timer = self.create_timer(self._pacer.wall_period_s, self._on_period, clock=self._wall)
 
@@ -313,7 +313,9 @@ class Simulator(Node):
 
     @property
     def _stamp_ns(self) -> int:
-        return self._first_stamp_ns + self._drive.step * self._period_ns
+        # Where simulated time is /clock, it may be late; where it is everybody's clock, stamps have to keep up with it.
+        late_ns = 0 if self._simulated_time else round(self._pacer.late_s * 1e9)
+        return self._first_stamp_ns + self._drive.step * self._period_ns + late_ns
 
     def _publish_set(self) -> None:
         """Everything the car shows of itself at this step; `power_demand` closes the set."""

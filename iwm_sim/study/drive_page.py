@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -18,7 +19,6 @@ BLUE, VERMILION, GREEN, PURPLE, OCHRE, SKY, GREY, BLACK = range(8)
 
 COLUMNS = (
     Column("strategy", "Strategy"),
-    Column("made", "Run"),
     Column("distance_km", "Distance", "km", 3),
     Column("wh_per_km", "Energy", "Wh/km", 2, best="low"),
     Column("delta_soc_percent", "ΔSoC", "%", 3, best="low"),
@@ -28,6 +28,7 @@ COLUMNS = (
     Column("max_slip", "Highest slip", "", 3),
     Column("share_changes_per_min", "Front share changes", "1/min", 1),
     Column("trace_held", "Trace"),
+    Column("made", "Run"),
 )
 
 
@@ -55,12 +56,15 @@ def row(driven: Driven, reference: Driven) -> dict[str, Any]:
     metrics = driven.metrics
     other = reference.metrics
     saving = None
-    if driven is not reference and abs(metrics.distance_m - other.distance_m) <= 1e-3 * other.distance_m:
+    same_distance = abs(metrics.distance_m - other.distance_m) <= 1e-3 * other.distance_m
+    if driven is not reference and same_distance and other.energy_wh != 0.0:
         saving = 100.0 * (1.0 - metrics.energy_wh / other.energy_wh)
-    values = metrics._asdict() | {"distance_km": metrics.distance_m / 1000.0}
+    values = metrics._asdict() | {"distance_km": metrics.distance_m / 1000.0, "saving_percent": saving}
     if np.isnan(driven.run["decided_share"]).all():
         values["share_changes_per_min"] = None
-    return {"strategy": driven.strategy, "made": driven.made, "saving_percent": saving, **values}
+    # JSON knows no NaN, and a table has a sign for what is missing.
+    values = {name: None if value is None or math.isnan(value) else value for name, value in values.items()}
+    return {"strategy": driven.strategy, "made": driven.made, **values}
 
 
 def drive_page(
@@ -130,14 +134,14 @@ def _panels(driven: Driven, reference: Driven, critical_slip: float) -> list[Pan
         Panel(
             "Speed",
             "m/s",
-            [Series("car", run["speed_mps"], BLUE), Series("cycle", run["trace_mps"], BLACK, dashed=True)],
+            [Series("car", run["speed_mps"], BLUE, wide=True), Series("cycle", run["trace_mps"], BLACK, dashed=True)],
         ),
         Panel(
             "Power",
             "kW",
             [
                 Series("demand P_dem", run["power_demand_w"] / 1e3, GREY),
-                Series("front P_f", _axle_power_w(run, "front") / 1e3, BLUE),
+                Series("front P_f", _axle_power_w(run, "front") / 1e3, BLUE, wide=True),
                 Series("rear P_r", _axle_power_w(run, "rear") / 1e3, VERMILION),
             ],
         ),
@@ -160,7 +164,7 @@ def _panels(driven: Driven, reference: Driven, critical_slip: float) -> list[Pan
             "Slip",
             "",
             [
-                Series("front", np.where(moving, run["front_slip"], np.nan), BLUE),
+                Series("front", np.where(moving, run["front_slip"], np.nan), BLUE, wide=True),
                 Series("rear", np.where(moving, run["rear_slip"], np.nan), VERMILION),
             ],
             decimals=4,
@@ -173,10 +177,10 @@ def _panels(driven: Driven, reference: Driven, critical_slip: float) -> list[Pan
             "Torque of a wheel",
             "N m",
             [
-                Series("front motor", run["front_motor_nm"], BLUE),
+                Series("front motor", run["front_motor_nm"], BLUE, wide=True),
                 Series("rear motor", run["rear_motor_nm"], VERMILION),
-                Series("front brake", run["front_friction_nm"], SKY, dashed=True),
-                Series("rear brake", run["rear_friction_nm"], OCHRE, dashed=True),
+                Series("front brake", run["front_friction_nm"], SKY, wide=True),
+                Series("rear brake", run["rear_friction_nm"], OCHRE),
             ],
             decimals=1,
         ),

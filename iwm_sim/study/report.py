@@ -150,13 +150,17 @@ class Table:
 
 @dataclass(frozen=True)
 class Series:
-    """A line of a chart: values over the chart's time (NaN: a gap), in palette colour 0..7."""
+    """A line of a chart: values over the chart's time (NaN: a gap), in palette colour 0..7.
+
+    A `wide` line still shows under a thin one that runs over it.
+    """
 
     name: str
     values: ArrayLike
     colour: int = 0
     dashed: bool = False
     step: bool = False
+    wide: bool = False
 
 
 @dataclass(frozen=True)
@@ -206,6 +210,7 @@ class Chart:
                         "colour": series.colour,
                         "dashed": series.dashed,
                         "step": series.step,
+                        "wide": series.wide,
                         "values": _compact(values),
                     }
                 )
@@ -404,7 +409,7 @@ def _page_font(font: str) -> str:
     return f"font: {size.group(1) if size else '10'}px system-ui, sans-serif"
 
 
-def _compact(values: NDArray[np.float64], digits: int = 5) -> list[float | int | None]:
+def _compact(values: NDArray[np.float64], digits: int = 7) -> list[float | int | None]:
     """Numbers of `digits` significant digits, whole ones as integers, NaN as null."""
     numbers: list[float | int | None] = []
     for value in values.tolist():

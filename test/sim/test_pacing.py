@@ -88,6 +88,7 @@ def test_a_long_stall_is_not():
     pacer.start(0.0)
     assert pacer.due(1.0) == 5
     assert pacer.stalls == 1
+    assert pacer.late_s == pytest.approx(0.95)
     assert pacer.due(1.01) == 1
 
 

@@ -99,7 +99,7 @@
       const now = panel.series.map((series) => {
         const key = node(head, "span", { class: "key" });
         const swatch = node(key, "svg", { viewBox: "0 0 22 10", "aria-hidden": "true" });
-        node(swatch, "line", { x1: 1, x2: 21, y1: 5, y2: 5, style: `stroke:var(--c${series.colour});stroke-width:2.4`, "stroke-dasharray": series.dashed ? "5 3" : "none" });
+        node(swatch, "line", { x1: 1, x2: 21, y1: 5, y2: 5, style: `stroke:var(--c${series.colour});stroke-width:${series.wide ? 4 : 2}`, "stroke-dasharray": series.dashed ? "5 3" : "none" });
         node(key, "span", {}, series.name);
         return node(key, "span", { class: "now" });
       });
@@ -115,7 +115,7 @@
       if (width < 80) return;
       all.disabled = view[0] === first && view[1] === end;
       const from = Math.max(0, search(time, view[0]) - 1), to = Math.min(time.length, search(time, view[1]) + 1);
-      const xTicks = ticks(view[0], view[1], (width - LEFT) / 90);
+      const xTicks = ticks(view[0], view[1], (width - LEFT) / 70);
       for (const item of panels) {
         const { panel, plot, last } = item;
         const height = PANEL + TOP + (last ? AXIS : 6), bottom = TOP + PANEL;
@@ -130,7 +130,7 @@
           node(plot, "line", { class: "gridline", x1: x(t), x2: x(t), y1: TOP, y2: bottom });
           if (last) node(plot, "text", { class: "tick", x: x(t), y: bottom + 15, "text-anchor": "middle" }, format(t, xTicks.decimals));
         }
-        const yTicks = panel.ticks ? { values: panel.ticks.map((t) => t[0]) } : ticks(low, high, 4);
+        const yTicks = panel.ticks ? { values: panel.ticks.map((t) => t[0]) } : ticks(low, high, 5);
         yTicks.values.forEach((value, k) => {
           if (value < low || value > high) return;
           node(plot, "line", { class: value === 0 ? "zero" : "gridline", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value) });
@@ -138,7 +138,7 @@
         });
         const lines = node(plot, "g", { "clip-path": `url(#${clip})` });
         for (const series of panel.series) {
-          node(lines, "path", { class: "series", d: path(time, series.values, from, to, x, y, series.step), style: `stroke:var(--c${series.colour})`, "stroke-dasharray": series.dashed ? "5 3" : "none" });
+          node(lines, "path", { class: "series", d: path(time, series.values, from, to, x, y, series.step), style: `stroke:var(--c${series.colour});stroke-width:${series.wide ? 2.8 : 1.4}`, "stroke-dasharray": series.dashed ? "5 3" : "none" });
         }
         for (const [value, label] of panel.references) {
           if (value < low || value > high) continue;
