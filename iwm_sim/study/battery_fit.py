@@ -1,0 +1,212 @@
+"""The paper's parameter estimation (eq. 25): the control model's battery, fitted to the plant's state of charge.
+
+The plant drives FTP-75 and HWFET with equal split; its electrical power goes through the static circuit of the control
+model (eq. 21, 22), whose resistance is chosen so that both states of charge agree best:
+
+    RMSE = sqrt( 1/N sum (SoC_plant - SoC_model)^2 )
+
+with the 1/N that eq. 25 lacks; without it the number grows with the length of the cycle (the minimum is the same).
+
+What the resistance comes out as hangs on the circuit's constant voltage. An LFP cell at 80 % charge stands above its
+nominal 3.3 V, so that a model at nominal voltage already draws too much current and compensates with a resistance that
+is too small. So the fit is made twice: at the nominal voltage, and with the voltage free as well.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize, minimize_scalar
+
+from iwm_power_manager.control.types import default_settings
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import atomic_write
+from iwm_power_manager.policy import empty_table
+from iwm_power_manager.vehicle import Battery, nominal_voltage_v, with_params
+from iwm_sim import closed_loop
+from iwm_sim.study import cases, figures
+from iwm_sim.study.cases import Case
+
+FloatArray = npt.NDArray[np.float64]
+
+CYCLES = ("ftp75", "hwfet")
+PAPER_RESISTANCE_OHM = 0.063
+
+#: Resistances searched, ohm.
+_HIGHEST_OHM = 0.5
+
+
+class Estimate(NamedTuple):
+    """A fitted circuit, and its error over all samples and on each cycle, in SoC (0..1)."""
+
+    resistance_ohm: float
+    voltage_v: float
+    rmse: float
+    rmse_by_cycle: dict[str, float]
+
+
+class Comparison(NamedTuple):
+    """Plant and fitted control model on one cycle, each (N,)."""
+
+    time_s: FloatArray
+    plant_speed_mps: FloatArray
+    model_speed_mps: FloatArray
+    plant_soc: FloatArray
+    model_soc: FloatArray
+
+
+class Fit(NamedTuple):
+    """Result of the estimation.
+
+    Attributes
+    ----------
+    nominal : resistance fitted, voltage nominal
+    free : both fitted
+    file : the circuit the vehicle's file has, for comparison
+    comparison : of the first cycle, with `free` (Fig. 7)
+    """
+
+    nominal: Estimate
+    free: Estimate
+    file: Estimate
+    comparison: Comparison
+
+    def text(self) -> str:
+        """The result in lines for a terminal."""
+        names = list(self.nominal.rmse_by_cycle)
+        head = f"{'circuit':<32}{'R, ohm':>10}{'Voc, V':>10}{'RMSE, % SoC':>14}" + "".join(f"{n:>12}" for n in names)
+        lines = [head]
+        for name, made in (
+            ("R fitted, nominal voltage", self.nominal),
+            ("R and voltage fitted", self.free),
+            ("vehicle file", self.file),
+        ):
+            lines.append(
+                f"{name:<32}{made.resistance_ohm:>10.4f}{made.voltage_v:>10.2f}{100.0 * made.rmse:>14.5f}"
+                + "".join(f"{100.0 * made.rmse_by_cycle[n]:>12.5f}" for n in names)
+            )
+        lines.append(f"the paper's estimate: {PAPER_RESISTANCE_OHM} ohm")
+        return "\n".join(lines)
+
+    def numbers(self) -> dict[str, Any]:
+        """The result as plain values."""
+        return {
+            "nominal": self.nominal._asdict(),
+            "free": self.free._asdict(),
+            "file": self.file._asdict(),
+            "paper_resistance_ohm": PAPER_RESISTANCE_OHM,
+        }
+
+
+def soc_of_model(
+    power_w: FloatArray, dt_s: float, resistance_ohm: float, voltage_v: float, capacity_ah: float, soc: float
+) -> FloatArray:
+    """State of charge of the static circuit at the start of each step, for the terminal power in it (eq. 21, 22)."""
+    root = np.maximum(voltage_v * voltage_v - 4.0 * resistance_ohm * power_w, 0.0)
+    current = 2.0 * power_w / (voltage_v + np.sqrt(root))
+    return soc - np.concatenate(([0.0], np.cumsum(current[:-1]))) * dt_s / (3600.0 * capacity_ah)
+
+
+def fit(
+    vehicle: str,
+    idle_drive: str = "",
+    cycles: Sequence[str] = CYCLES,
+    friction: float = 0.9,
+    soc: float = 0.8,
+) -> Fit:
+    """Drive the cycles with the plant and equal split, and fit the static circuit to it."""
+    runs = {}
+    for cycle in cycles:
+        case = Case(cycle, vehicle, idle_drive, friction, "equal", soc=soc)
+        cases.check(case)
+        runs[cases.cycle_of(cycle).name] = cases.drive(case)
+    battery = cases.vehicle_of(vehicle, idle_drive).params.battery
+    nominal_v = nominal_voltage_v(battery)
+
+    def estimate(resistance_ohm: float, voltage_v: float) -> Estimate:
+        squares = {name: _squared_errors(run, resistance_ohm, voltage_v, battery) for name, run in runs.items()}
+        return Estimate(
+            float(resistance_ohm),
+            float(voltage_v),
+            float(np.sqrt(np.mean(np.concatenate(list(squares.values()))))),
+            {name: float(np.sqrt(np.mean(errors))) for name, errors in squares.items()},
+        )
+
+    alone = minimize_scalar(
+        lambda ohm: estimate(ohm, nominal_v).rmse,
+        bounds=(0.0, _HIGHEST_OHM),
+        method="bounded",
+        options={"xatol": 1e-6},
+    )
+    both = minimize(
+        lambda x: 1e6 * estimate(x[0], x[1] * nominal_v).rmse,
+        x0=(battery.resistance_ohm, 1.01),
+        bounds=((0.0, _HIGHEST_OHM), (0.8, 1.2)),
+        method="Nelder-Mead",
+        options={"xatol": 1e-6, "fatol": 1e-6},
+    )
+    free = estimate(both.x[0], both.x[1] * nominal_v)
+    return Fit(
+        nominal=estimate(alone.x, nominal_v),
+        free=free,
+        file=estimate(battery.resistance_ohm, nominal_v),
+        comparison=_comparison(vehicle, idle_drive, cycles[0], friction, soc, runs, free, battery),
+    )
+
+
+def _squared_errors(run: closed_loop.Run, resistance_ohm: float, voltage_v: float, battery: Battery) -> FloatArray:
+    soc = run["soc"]
+    model = soc_of_model(
+        run["electrical_power_w"], run.dt_s, resistance_ohm, voltage_v, battery.capacity_ah, float(soc[0])
+    )
+    error: FloatArray = (model - soc) ** 2
+    return error
+
+
+def _comparison(
+    vehicle: str,
+    idle_drive: str,
+    cycle: str,
+    friction: float,
+    soc: float,
+    runs: dict[str, closed_loop.Run],
+    circuit: Estimate,
+    battery: Battery,
+) -> Comparison:
+    """The plant beside the control model: the same car with the static circuit and motors that do not heat up."""
+    plant = runs[cases.cycle_of(cycle).name]
+    params = cases.vehicle_of(vehicle, idle_drive).params
+    cell_v = circuit.voltage_v / battery.cells_in_series
+    static = battery._replace(
+        ocv_cell_v=np.full_like(battery.ocv_cell_v, cell_v),
+        ohmic_resistance_ohm=max(circuit.resistance_ohm, 1e-9),
+        ohmic_factor_at_10_percent=1.0,
+        polarisation_resistance_ohm=0.0,
+    )
+    motor = params.motor._replace(continuous_torque_nm=params.motor.peak_torque_nm)
+    model = closed_loop.run(
+        cases.cycle_of(cycle),
+        with_params(
+            cases.vehicle_of(vehicle, idle_drive), "control model", params._replace(battery=static, motor=motor)
+        ),
+        default_settings("equal"),
+        empty_table(),
+        friction,
+        soc=soc,
+    )
+    return Comparison(plant["time_s"], plant["speed_mps"], model["speed_mps"], plant["soc"], model["soc"])
+
+
+def save_picture(made: Fit, path: str) -> None:
+    """Fig. 7 as an SVG or PNG file."""
+    kind = Path(path).suffix.lower()
+    if kind not in (".svg", ".png"):
+        raise ConfigError("arguments", "--plot", f"{path} is no picture's name", "a name that ends in .svg or .png")
+    stream = io.BytesIO()
+    figures.model_comparison(*made.comparison).savefig(stream, format=kind[1:], dpi=150, facecolor="white")
+    atomic_write(path, stream.getvalue())

@@ -1,0 +1,382 @@
+"""What a case is: one drive of one car over one cycle on one road with one strategy; and what its result amounts to.
+
+A case holds file names and plain numbers only, so that it travels to a worker process as it is. Everything it needs is
+loaded there, once for each worker. The same case always gives the same numbers, whoever drives it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from iwm_power_manager.control.types import SDP, SDP_LOOKAHEAD, STRATEGIES, Settings, default_settings
+from iwm_power_manager.cycle import Cycle, load_cycle
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import atomic_write
+from iwm_power_manager.policy import Policy, PolicyTable, empty_table, load_policy
+from iwm_power_manager.share import resolve
+from iwm_power_manager.vehicle import Vehicle, VehicleParams, load_vehicle, with_params
+from iwm_sim import closed_loop, preview
+from iwm_sim.closed_loop import Noise, Run
+from iwm_sim.metrics import Metrics, measure
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Strategies that need a solved policy.
+POLICY_STRATEGIES = frozenset(name for name, code in STRATEGIES.items() if code in (SDP, SDP_LOOKAHEAD))
+
+#: Every saving is against this one.
+REFERENCE = "equal"
+
+#: Energies of two runs are compared if the distances differ by no more than this.
+SAME_DISTANCE = 1e-3
+
+#: The cycle the generalized rule is fitted to, as in the paper.
+RULE_CYCLE = "config/cycles/ftp75.csv"
+
+#: The largest step a case may have: beyond it, the law's time constants mean nothing.
+MAX_DT_S = 0.1
+
+
+class SensorNoise(NamedTuple):
+    """White noise of the sensors, rms, with the seed it is drawn from."""
+
+    speed_mps: float = 0.0
+    wheel_radps: float = 0.0
+    seed: int = 1
+
+
+NO_NOISE = SensorNoise()
+
+
+class Change(NamedTuple):
+    """A number of the car that is not what its file says: `chassis.mass_kg` becomes `value`."""
+
+    section: str
+    name: str
+    value: float
+
+
+@dataclass(frozen=True)
+class Case:
+    """One drive.
+
+    Attributes
+    ----------
+    cycle, vehicle : files, or names of files of the package
+    idle_drive : "none", "drag" or "enabled"
+    friction : peak friction coefficient of the road
+    strategy : name in `STRATEGIES`
+    label : what tables call it; "" is the strategy
+    settings : of the law; its strategy is replaced by `strategy`
+    policy : policy file; "" if the strategy needs none
+    rule : coefficients of strategy `rule`
+    switching_cost_j, switching_fixed_cost_j : of strategy `preview`
+    dt_s, substeps : control step, plant steps in it
+    soc : at the start
+    assumed_friction : what the law is told; None is the truth
+    noise : of the sensors
+    car : changes of the car, known to driver and law
+    plant : changes of the car nobody knows of
+    keep : columns of `closed_loop.COLUMNS` to hand back
+    """
+
+    cycle: str
+    vehicle: str
+    idle_drive: str
+    friction: float
+    strategy: str
+    label: str = ""
+    settings: Settings = field(default_factory=default_settings)
+    policy: str = ""
+    rule: tuple[float, ...] = ()
+    switching_cost_j: float = 0.0
+    switching_fixed_cost_j: float = 0.0
+    dt_s: float = 0.01
+    substeps: int = 1
+    soc: float = 0.8
+    assumed_friction: float | None = None
+    noise: SensorNoise = NO_NOISE
+    car: tuple[Change, ...] = ()
+    plant: tuple[Change, ...] = ()
+    keep: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What tables call the strategy."""
+        return self.label or self.strategy
+
+    @property
+    def told_friction(self) -> float:
+        """Friction the law assumes."""
+        return self.friction if self.assumed_friction is None else self.assumed_friction
+
+
+class Result(NamedTuple):
+    """A driven case: its metrics, and the columns it was to keep."""
+
+    case: Case
+    metrics: Metrics
+    series: dict[str, FloatArray]
+
+
+@functools.lru_cache(maxsize=16)
+def cycle_of(path: str) -> Cycle:
+    """A cycle by file or short name."""
+    return load_cycle(resolve(path))
+
+
+@functools.lru_cache(maxsize=16)
+def vehicle_of(path: str, idle_drive: str, changes: tuple[Change, ...] = ()) -> Vehicle:
+    """A car by file or short name, with some of its numbers changed."""
+    vehicle = load_vehicle(resolve(path), idle_drive or None)
+    return with_params(vehicle, vehicle.name, changed(vehicle.params, changes)) if changes else vehicle
+
+
+@functools.lru_cache(maxsize=16)
+def policy_of(path: str) -> Policy:
+    """A verified policy."""
+    return load_policy(path)
+
+
+@functools.lru_cache(maxsize=8)
+def _table_of(path: str) -> PolicyTable:
+    return policy_of(path).table()
+
+
+def changed(params: VehicleParams, changes: Sequence[Change]) -> VehicleParams:
+    """The numbers of a car with some of them replaced."""
+    for change in changes:
+        section = getattr(params, change.section)._replace(**{change.name: float(change.value)})
+        params = params._replace(**{change.section: section})
+    return params
+
+
+def drive(case: Case, until_s: float = np.inf) -> Run:
+    """Drive a case, or only its first `until_s` seconds.
+
+    Raises
+    ------
+    ConfigError, PolicyError
+        A file of it is wrong, or its policy was solved for another car.
+    """
+    cycle = cycle_of(case.cycle)
+    vehicle = vehicle_of(case.vehicle, case.idle_drive, case.car)
+    settings = case.settings._replace(strategy=STRATEGIES[case.strategy])
+    return closed_loop.run(
+        cycle,
+        vehicle,
+        settings,
+        _policy_table(case, vehicle, until_s),
+        case.friction,
+        assumed_friction=case.assumed_friction,
+        dt_s=case.dt_s,
+        substeps=case.substeps,
+        soc=case.soc,
+        until_s=until_s,
+        noise=_noise(case.noise, cycle, case.dt_s),
+        plant_vehicle=vehicle_of(case.vehicle, case.idle_drive, case.car + case.plant) if case.plant else None,
+    )
+
+
+def result(case: Case) -> Result:
+    """Drive a case and measure it."""
+    run = drive(case)
+    truth = vehicle_of(case.vehicle, case.idle_drive, case.car + case.plant)
+    return Result(case, measure(run, truth.params), {name: run[name].copy() for name in case.keep})
+
+
+def _policy_table(case: Case, vehicle: Vehicle, until_s: float) -> PolicyTable:
+    if case.strategy in POLICY_STRATEGIES:
+        policy_of(case.policy).check_vehicle(vehicle, case.policy)
+        return _table_of(case.policy)
+    if case.strategy == "rule":
+        return empty_table(rule=case.rule)
+    if case.strategy == "preview":
+        return empty_table(schedule=known_in_advance(case, vehicle, until_s)[1].tolist())
+    return empty_table()
+
+
+def known_in_advance(case: Case, vehicle: Vehicle, until_s: float = np.inf) -> tuple[Run, FloatArray]:
+    """A drive of the cycle with equal split, and the best schedule for the demand it had (`preview.schedule`)."""
+    equal = closed_loop.run(
+        cycle_of(case.cycle),
+        vehicle,
+        case.settings._replace(strategy=STRATEGIES[REFERENCE]),
+        empty_table(),
+        case.friction,
+        assumed_friction=case.assumed_friction,
+        dt_s=case.dt_s,
+        substeps=case.substeps,
+        soc=case.soc,
+        until_s=until_s,
+    )
+    schedule = preview.schedule(
+        equal["power_demand_w"],
+        equal["speed_mps"],
+        case.dt_s,
+        case.settings.decision_period_s,
+        vehicle.params,
+        case.told_friction,
+        empty_table().share,
+        case.switching_cost_j,
+        case.switching_fixed_cost_j,
+    )
+    return equal, schedule
+
+
+class Rule(NamedTuple):
+    """The generalized rule and what it was fitted to: demand and schedule of each decision, and the line's numbers."""
+
+    coefficients: tuple[float, ...]
+    power_demand_w: FloatArray
+    front_share: FloatArray
+
+
+def fitted_rule(case: Case) -> Rule:
+    """Strategy `rule` for a case's car and road: dynamic programming on FTP-75 and straight lines through it.
+
+    On equal motors the front axle alone and the rear axle alone are as good, and a line through a mixture of both says
+    neither. So the lines are also fitted with every split turned to the front, and to the rear; of the three, the one
+    that drives FTP-75 with the least energy is the rule.
+    """
+    over = dataclasses.replace(case, cycle=RULE_CYCLE, strategy="rule", keep=())
+    equal, schedule = known_in_advance(over, vehicle_of(case.vehicle, case.idle_drive, case.car))
+    demand = equal["power_demand_w"][:: round(case.settings.decision_period_s / case.dt_s)]
+    candidates = [
+        Rule(tuple(preview.fit_rule(demand, share).tolist()), demand, share)
+        for share in (schedule, np.maximum(schedule, 1.0 - schedule), np.minimum(schedule, 1.0 - schedule))
+    ]
+    return min(candidates, key=lambda rule: result(dataclasses.replace(over, rule=rule.coefficients)).metrics.wh_per_km)
+
+
+def _noise(noise: SensorNoise, cycle: Cycle, dt_s: float) -> Noise:
+    if noise.speed_mps == 0.0 and noise.wheel_radps == 0.0:
+        return closed_loop.NO_NOISE
+    steps = int(cycle.duration_s / dt_s) + 2
+    random = np.random.default_rng(noise.seed)
+    return Noise(
+        noise.speed_mps * random.standard_normal(steps), noise.wheel_radps * random.standard_normal((steps, 4))
+    )
+
+
+def check(case: Case) -> None:
+    """Refuse what argument types cannot exclude, before any work is done: bad files, a step that fits nothing."""
+    cycle = cycle_of(case.cycle)
+    vehicle_of(case.vehicle, case.idle_drive, case.car + case.plant)
+    if cycle.duration_s < 2 * case.dt_s:
+        raise ConfigError(case.cycle, "time_s", f"{cycle.duration_s:g} s is too short", f">= {2 * case.dt_s:g} s")
+    period = case.settings.decision_period_s / case.dt_s
+    if case.strategy in ("preview", "rule") and abs(period - round(period)) > 1e-6:
+        raise ConfigError(
+            "arguments",
+            "--dt",
+            f"{case.dt_s:g} s does not divide the decision period {case.settings.decision_period_s:g} s, which "
+            f"{case.strategy} needs",
+            "for instance 0.01, 0.005, 0.002 s",
+        )
+
+
+def save_series(folder: Path | str, made: Result) -> None:
+    """Write what a result kept as a compressed .npz named after the case; `ConfigError` if it cannot be written."""
+    case = made.case
+    name = f"{cycle_of(case.cycle).name}_{case.idle_drive}_mu{round(case.friction * 100):03d}_{case.name}.npz"
+    stream = io.BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, **made.series)
+    atomic_write(Path(folder) / name, stream.getvalue())
+
+
+# --- what a result amounts to beside others -------------------------------------------------------------------------
+
+
+def comparable(one: Metrics, other: Metrics) -> bool:
+    """Whether two runs covered the same distance, so that their energies may be compared."""
+    return abs(one.distance_m - other.distance_m) <= SAME_DISTANCE * other.distance_m
+
+
+def saving_percent(one: Metrics, reference: Metrics) -> float | None:
+    """Energy saved against a reference, %; None where the distances differ."""
+    if not comparable(one, reference) or reference.energy_wh <= 0.0:
+        return None
+    return 100.0 * (1.0 - one.energy_wh / reference.energy_wh)
+
+
+def rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """A row of plain values for each result, with its saving against the equal split of the same drive.
+
+    Results belong together if they differ in nothing but strategy, label, policy and law settings. `share_of_possible`
+    is the saving as a part of that of `preview`, where both are there and there is anything to save.
+    """
+    references: dict[tuple[Any, ...], Metrics] = {}
+    bounds: dict[tuple[Any, ...], Metrics] = {}
+    for made in results:
+        group = _group(made.case)
+        if made.case.strategy == REFERENCE:
+            references.setdefault(group, made.metrics)
+        if made.case.strategy == "preview":
+            bounds.setdefault(group, made.metrics)
+    return [_row(made, references.get(_group(made.case)), bounds.get(_group(made.case))) for made in results]
+
+
+def _group(case: Case) -> tuple[Any, ...]:
+    return (
+        *(case.cycle, case.vehicle, case.idle_drive, case.friction, case.dt_s, case.substeps, case.soc),
+        *(case.assumed_friction, case.noise, case.car, case.plant),
+    )
+
+
+#: A possible saving below this, %, has no parts.
+_LEAST_POSSIBLE_PERCENT = 0.01
+
+
+def _row(made: Result, reference: Metrics | None, bound: Metrics | None) -> dict[str, Any]:
+    case = made.case
+    saving = saving_percent(made.metrics, reference) if reference else None
+    possible = saving_percent(bound, reference) if reference and bound else None
+    share = None
+    if saving is not None and possible is not None and possible > _LEAST_POSSIBLE_PERCENT:
+        share = saving / possible
+    policy = policy_of(case.policy) if case.policy else None
+    vehicle = vehicle_of(case.vehicle, case.idle_drive, case.car)
+    return {
+        "cycle": cycle_of(case.cycle).name,
+        "friction": case.friction,
+        "strategy": case.strategy,
+        "label": case.name,
+        "idle_drive": vehicle.idle_drive,
+        **{name: _plain(value) for name, value in made.metrics._asdict().items()},
+        "saving_percent": saving,
+        "share_of_possible": share,
+        "same_distance_as_equal": comparable(made.metrics, reference) if reference else None,
+        "assumed_friction": case.told_friction,
+        "dt_s": case.dt_s,
+        "initial_soc": case.soc,
+        "noise": case.noise._asdict(),
+        "plant_changes": {f"{c.section}.{c.name}": c.value for c in case.plant},
+        "settings": case.settings._replace(strategy=STRATEGIES[case.strategy])._asdict(),
+        "rule": list(case.rule) or None,
+        "preview_switching_cost_j": (
+            [case.switching_cost_j, case.switching_fixed_cost_j] if case.strategy == "preview" else None
+        ),
+        "vehicle": vehicle.name,
+        "vehicle_hash": vehicle.hash,
+        "cycle_sha256": cycle_of(case.cycle).sha256,
+        "policy_checksum": policy.checksum if policy else None,
+        "policy_friction": policy.friction if policy else None,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """A metric as JSON takes it: NaN (nothing was driven) is null."""
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    number = float(value)
+    return number if np.isfinite(number) else None

@@ -1,0 +1,139 @@
+"""Which policy a case drives with: one of a folder that fits car and road, or one solved now and kept for next time."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from iwm_power_manager import jit
+from iwm_power_manager.errors import IwmError, PolicyError
+from iwm_power_manager.files import read_bytes
+from iwm_power_manager.policy import Policy, choose, load_policy
+from iwm_power_manager.share import resolve
+from iwm_power_manager.tools import solve_policy
+from iwm_power_manager.vehicle import Vehicle
+from iwm_sim.study.cases import policy_of
+
+#: Cycles a policy learns its demand from, as in the paper. UDDS is a part of FTP-75.
+TRAINING_CYCLES = tuple(f"config/cycles/{name}.csv" for name in ("ftp75", "hwfet", "nycc"))
+
+#: Grid of a policy that is solved because none was found.
+DEFAULT_GRID = "fine"
+
+
+class PolicySource:
+    """Finds policies in a folder or a file, and solves those that are missing.
+
+    Parameters
+    ----------
+    path : folder (searched with its subfolders) or policy file
+    grid : of a policy that has to be solved
+    may_solve : False makes a missing policy an error
+    say : told, in one line, of everything that is solved
+    """
+
+    def __init__(
+        self, path: str, grid: str = DEFAULT_GRID, may_solve: bool = True, say: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self._path = resolve(path)
+        self._given = path
+        self._grid = grid
+        self._may_solve = may_solve
+        self._say = say
+        self._bank: dict[str, Policy] | None = None
+
+    def find(self, vehicle: Vehicle, friction: float) -> str:
+        """File of the policy for a car on a road: that for the nearest friction, as the power manager chooses it.
+
+        A file that was named has to fit. Of a folder, the policies for other cars do not count, and where none is left
+        one is solved for exactly this friction.
+
+        Raises
+        ------
+        PolicyError, ConfigError
+        """
+        bank = self._load()
+        if self._path.is_file():
+            ((file, policy),) = bank.items()
+            policy.check_vehicle(vehicle, file)
+            return file
+        fitting = {file: policy for file, policy in bank.items() if policy.vehicle_hash == vehicle.hash}
+        if fitting:
+            best = choose(list(fitting.values()), friction)
+            return next(file for file, policy in fitting.items() if policy is best)
+        problem = f"{self._given}: holds no policy for '{vehicle.name}' with idle_drive {vehicle.idle_drive}"
+        if not self._may_solve:
+            raise PolicyError(f"{problem}; solve one with solve_policy")
+        return solved(vehicle, friction, self._grid, self._say, because=problem)
+
+    def _load(self) -> dict[str, Policy]:
+        if self._bank is None:
+            if self._path.is_dir():
+                files = sorted(self._path.rglob("*.npz"))
+            elif self._path.is_file() or self._path.suffix == ".npz":
+                files = [self._path]
+            else:
+                raise PolicyError(f"{self._given}: is neither a policy file nor a folder")
+            self._bank = {str(file): policy_of(str(file)) for file in files}
+        return self._bank
+
+
+def solved(
+    vehicle: Vehicle,
+    friction: float,
+    grid: str,
+    say: Callable[[str], None] = lambda _: None,
+    because: str = "",
+    cycles: Sequence[str] = TRAINING_CYCLES,
+) -> str:
+    """A policy for a car (as its file has it) and a road, from the user's cache, or solved now.
+
+    Parameters
+    ----------
+    vehicle, friction : what it is for
+    grid : preset or file
+    say : told in one line if it is solved
+    because : why it is needed, for that line
+    cycles : it learns its demand from
+
+    Returns
+    -------
+    its file
+
+    Raises
+    ------
+    IwmError
+        It cannot be solved or written; the reason stands on standard error.
+    """
+    grid_file = grid_path(grid)
+    digest = hashlib.sha256(f"{vehicle.hash} {friction!r} {jit.source_hash()}".encode())
+    for file in (grid_file, *map(resolve, cycles)):
+        digest.update(read_bytes(file))
+    folder = jit.cache_folder().parent / "policies"
+    file = folder / f"{digest.hexdigest()[:24]}.npz"
+    if not _is_whole(file):
+        what = f"solving the policy on grid {grid_file.stem} for friction {friction:g}, idle_drive {vehicle.idle_drive}"
+        say(f"{because}; {what}" if because else what)
+        folder.mkdir(parents=True, exist_ok=True)
+        arguments = ["--vehicle", str(vehicle.path), "--idle-drive", vehicle.idle_drive, "--friction", repr(friction)]
+        for cycle in cycles:
+            arguments += ["--cycle", str(resolve(cycle))]
+        code = solve_policy.main([*arguments, "--grid", str(grid_file), "--output", str(file), "--quiet"])
+        if code not in (solve_policy.SOLVED, solve_policy.UNSOLVED):
+            raise IwmError(f"no policy on grid {grid} for {vehicle.path}, friction {friction:g}")
+    return str(file)
+
+
+def grid_path(grid: str) -> Path:
+    """File of a grid: a preset by name, or the file itself."""
+    preset = resolve(f"config/grids/{grid}.yaml")
+    return preset if preset.exists() else resolve(grid)
+
+
+def _is_whole(file: Path) -> bool:
+    try:
+        load_policy(file)
+    except PolicyError:
+        return False
+    return True
