@@ -199,11 +199,14 @@ def step(
     sign = -1.0 if braking else 1.0
     front_total = sign * front_given / (2.0 * front_conversion)
     rear_total = sign * rear_given / (2.0 * rear_conversion)
-    for asked, given, room, grip, fast in (
-        (front_asked, front_given, front_room, front_grip, front_fast),
-        (rear_asked, rear_given, rear_room, rear_grip, rear_fast),
+    tolerance = ROUNDING * abs(demand)
+    # Where both axles together fall short, each of them is at its limit, whatever its own part was.
+    short = front_asked + rear_asked - front_given - rear_given > tolerance
+    for asked, given, gated, room, grip, fast in (
+        (front_asked, front_given, front_gated, front_room, front_grip, front_fast),
+        (rear_asked, rear_given, rear_gated, rear_room, rear_grip, rear_fast),
     ):
-        if asked - given > ROUNDING * abs(demand):
+        if not gated and (short or asked - given > tolerance):
             if grip < room:
                 limits |= LIMIT_SLIP
             elif braking:
