@@ -1,0 +1,591 @@
+"""The control law: what no input may make it do, what it owes to every demand, and every step against plain Python."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iwm_power_manager.control import law
+from iwm_power_manager.control import types as t
+from iwm_power_manager.control.types import Command, ControllerState, Measurement, Settings, default_settings, initial_state
+from iwm_power_manager.policy import empty_table
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+from oracles import control_law as oracle
+from oracles.physics import regeneration_limit, torque_limit
+from oracles.splits import rule
+from oracles.step import G, electrical_w, friction_coefficient
+
+#: At least 500 in every run, 20,000 in the nightly profile.
+EXAMPLES = max(500, settings().max_examples)
+
+CARS = {name: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), name).params
+        for name in ("none", "drag", "enabled")}
+CAR = CARS["drag"]
+RADIUS = CAR.wheel.radius_m
+TABLE = empty_table(rule=(300.0, 0.4, -200.0, 0.7), schedule=(0.5, 0.0, 1.0, 0.3, 0.85, 1.0))
+DEFAULT = default_settings()
+NO_LIMIT = 47500.0
+
+#: A power below this is the rounding of torques to zero (1e-6 N m at 200 rad/s, four wheels), W.
+POWER_SLACK_W = 1e-3
+TORQUE_SLACK_NM = 1e-9
+
+
+class Case(NamedTuple):
+    """One step with everything that went into it and came out."""
+
+    m: Measurement
+    before: ControllerState
+    settings: Settings
+    car: Any
+    command: Command
+    after: ControllerState
+
+    @property
+    def braking(self):
+        return self.m.power_demand_w < 0.0
+
+    def axles(self):
+        """Front and rear: wheel speeds, motor and friction torque, torque and heat before, whether it is gated."""
+        c, b, w = self.command, self.before, self.m.wheel_speed_radps
+        return (
+            (w[:2], c.motor_torque_nm[0], c.friction_torque_nm[0], b.front_motor_nm, b.front_heat, c.gate & 1),
+            (w[2:], c.motor_torque_nm[2], c.friction_torque_nm[2], b.rear_motor_nm, b.rear_heat, c.gate & 2),
+        )
+
+    def conversion(self, wheels):
+        held = self.m.speed_mps * (1.0 - self.settings.critical_slip) / RADIUS
+        return max(0.5 * sum(wheels), held, self.car.driver.power_speed_floor_mps / RADIUS)
+
+    def delivered_w(self):
+        """Power of motors and brakes at the speeds that turn power into torque."""
+        return sum(2.0 * self.conversion(wheels) * (motor + brake) for wheels, motor, brake, *_ in self.axles())
+
+    def grip_nm(self, i):
+        """What the slip limiter leaves an axle."""
+        if self.settings.gate_mode != t.GATE_MODE_LIMITER:
+            return math.inf
+        wheels = self.axles()[i][0]
+        road = (self.after.front_road_nm, self.after.rear_road_nm)[i]
+        worst = min(wheels) if self.braking else max(wheels)
+        return oracle.grip(self.braking, road, worst, self.m.speed_mps, self.settings, self.car)
+
+    def battery_w(self, factor=1.0):
+        return sum(
+            2.0 * electrical_w(factor * motor, 0.5 * sum(wheels), self.car.motor) for wheels, motor, *_ in self.axles()
+        )
+
+
+def take(m, before=None, s=DEFAULT, car=CAR):
+    before = initial_state() if before is None else before
+    return Case(m, before, s, car, *law.step(m, before, s, car, TABLE))
+
+
+def measurement(speed=15.0, slips=(0.0, 0.0), demand=5000.0, dt=0.01, discharge=NO_LIMIT, charge=NO_LIMIT, **changes):
+    wheels = tuple(speed / RADIUS * (1.0 + x if x < 0.0 else 1.0 / (1.0 - x)) for x in slips for _ in range(2))
+    return Measurement(speed, wheels, demand, dt, 0.9, discharge, charge, 0.8)._replace(**changes)
+
+
+def settle(m, s=DEFAULT, car=CAR, steps=200):
+    """The same measurement, held until the law has settled."""
+    case = take(m, None, s, car)
+    for _ in range(steps):
+        case = take(m, case.after, s, car)
+    return case
+
+
+# --- Anything that can be measured, remembered or set ----------------------------------------------------------------
+
+
+def number(low, high, *special):
+    return st.one_of(st.sampled_from([float(x) for x in special]), st.floats(float(low), float(high)))
+
+
+SPEEDS = number(0, 60, 0, 0.5, 1, 2, 3)
+SLIPS = number(-1, 0.9, 0, 0.01, -0.01, 0.2, -0.2, -0.201, -0.15, 0.21)
+DEMANDS = number(-40e3, 40e3, 0, 0.5, -0.5, 1e6, -1e6, 30e3, -1e-9)
+POWER_LIMITS = number(1e-3, 47500, 0, 47500)
+TORQUES = number(-100, 220, 0, 200, -80)
+
+
+@st.composite
+def measurements(draw, dt=None):
+    speed = draw(SPEEDS)
+    spread = draw(number(-5, 5, 0, 0))
+    wheels = []
+    for _ in range(2):
+        wheel = speed / RADIUS * (1.0 + draw(SLIPS)) if draw(st.booleans()) else draw(number(-60, 220, 0))
+        wheels += [wheel, wheel + spread]
+    return Measurement(
+        speed,
+        tuple(wheels),
+        draw(DEMANDS),
+        dt or draw(st.sampled_from((0.001, 0.005, 0.01, 0.02, 0.1))),
+        0.9,
+        draw(POWER_LIMITS),
+        draw(POWER_LIMITS),
+        0.8,
+    )
+
+
+@st.composite
+def tunings(draw):
+    return DEFAULT._replace(
+        strategy=draw(st.sampled_from((t.EQUAL, t.RULE, t.PREVIEW, t.PREVIEW))),
+        decision_period_s=draw(st.sampled_from((0.02, 0.1))),
+        share_rate_per_s=draw(st.sampled_from((2.0, 20.0))),
+        gate_mode=draw(st.sampled_from((t.GATE_MODE_OFF, t.GATE_MODE_TABLE2, t.GATE_MODE_LIMITER, t.GATE_MODE_LIMITER))),
+        critical_slip=draw(st.sampled_from((0.2, 0.1))),
+        gate_hysteresis=draw(st.sampled_from((0.0, 0.05))),
+        gate_driving=draw(st.booleans()),
+        slip_target=draw(st.sampled_from((0.15, 0.08))),
+        slip_filter_s=draw(st.sampled_from((0.0, 0.02))),
+        slip_speed_floor_mps=draw(st.sampled_from((0.5, 1.0))),
+        slew_up_nmps=draw(st.sampled_from((1600.0, 300.0))),
+        slew_down_nmps=draw(st.sampled_from((20000.0, 900.0))),
+        slew_regeneration_nmps=draw(st.sampled_from((4000.0, 500.0))),
+    )
+
+
+@st.composite
+def memories(draw):
+    """Any state the law may find itself in, whether a drive can lead there or not."""
+    share, heat, slip = st.floats(0.0, 1.0), number(0, 1.2, 0), number(-1, 1, 0, -0.2)
+    motors = draw(TORQUES), draw(TORQUES)
+    return ControllerState(
+        draw(st.integers(0, 2)),
+        draw(st.integers(0, 9)),
+        draw(number(0, 0.2, 0)),
+        draw(share),
+        draw(share),
+        *motors,
+        *(x + draw(number(-500, 0, 0)) for x in motors),
+        *(draw(number(-20, 200, 30)) for _ in range(2)),
+        *(draw(number(-500, 250, 0)) for _ in range(2)),
+        draw(slip),
+        draw(slip),
+        draw(st.booleans()),
+        draw(st.booleans()),
+        draw(heat),
+        draw(heat),
+    )
+
+
+CASES = st.builds(take, measurements(), memories(), tunings(), st.sampled_from(list(CARS.values())))
+
+
+# --- What holds in every step ----------------------------------------------------------------------------------------
+
+
+def every_number_is_finite(case):
+    flat = [*case.command[0], *case.command[1], *case.command[2:], *case.after]
+    assert all(math.isfinite(x) for x in flat)
+
+
+def the_motors_stay_within_torque_and_power(case):
+    for wheels, motor, _, _, heat, _ in case.axles():
+        fastest = max(*wheels, 0.0)
+        assert motor <= torque_limit(fastest, heat, case.car.motor) * (1.0 + 1e-12)
+        assert abs(motor) * fastest <= case.car.motor.max_power_w * (1.0 + 1e-12)
+
+
+def regeneration_stays_within_its_limit_and_fades_at_low_speed(case):
+    for wheels, motor, _, _, heat, _ in case.axles():
+        limit = regeneration_limit(max(*wheels, 0.0), case.m.speed_mps, heat, case.car.motor)
+        assert motor >= -limit - TORQUE_SLACK_NM
+
+
+def friction_brakes_only_brake_and_only_on_demand(case):
+    for _, _, brake, *_ in case.axles():
+        assert -case.car.friction_brake.max_torque_nm <= brake <= 0.0
+        assert case.braking or brake == 0.0
+
+
+def left_and_right_get_the_same(case):
+    for torque in (case.command.motor_torque_nm, case.command.friction_torque_nm):
+        assert torque[0] == torque[1]
+        assert torque[2] == torque[3]
+
+
+def a_gated_axle_has_no_torque_at_all(case):
+    assert case.command.gate == case.after.front_gated + 2 * case.after.rear_gated
+    for _, motor, brake, _, _, gated in case.axles():
+        assert not gated or (motor == 0.0 and brake == 0.0)
+    if case.settings.gate_mode == t.GATE_MODE_OFF:
+        assert case.command.gate == t.GATE_NONE
+
+
+def torque_grows_no_faster_than_its_rate(case):
+    dt, s = case.m.dt_s, case.settings
+    for _, motor, _, before, *_ in case.axles():
+        slack = TORQUE_SLACK_NM + 1e-12 * abs(before)
+        assert motor <= max(before, 0.0) + s.slew_up_nmps * dt + slack
+        assert motor >= min(before, 0.0) - s.slew_regeneration_nmps * dt - slack
+
+
+def torque_falls_no_faster_than_its_rate_but_by_a_gate_or_a_limit(case):
+    fall = case.settings.slew_down_nmps * case.m.dt_s
+    battery = t.LIMIT_BATTERY_CHARGE | t.LIMIT_BATTERY_DISCHARGE
+    for i, (wheels, motor, _, before, heat, gated) in enumerate(case.axles()):
+        if gated or case.command.limits & battery or abs(before) <= fall:
+            continue
+        towards_zero = math.copysign(abs(before) - fall, before)
+        fast = max(*wheels, case.conversion(wheels))
+        if before > 0.0:
+            room = torque_limit(fast, heat, case.car.motor)
+            if not case.braking:
+                room = min(room, case.grip_nm(i))
+            assert motor >= min(towards_zero, room) - 1e-6
+        else:
+            room = regeneration_limit(fast, case.m.speed_mps, heat, case.car.motor)
+            if case.braking:
+                room = min(room, case.grip_nm(i))
+            assert motor <= max(towards_zero, -room) + 1e-6
+
+
+def without_gate_and_limit_the_torques_sum_to_the_demand(case):
+    assert case.delivered_w() == pytest.approx(case.command.front_power_w + case.command.rear_power_w, abs=1e-6, rel=1e-9)
+    if case.command.gate == t.GATE_NONE and case.command.limits == 0:
+        assert case.delivered_w() == pytest.approx(case.m.power_demand_w, rel=1e-9, abs=POWER_SLACK_W)
+
+
+def braking_always_gets_through(case):
+    if not case.braking or case.command.gate == t.GATE_BOTH or case.command.limits & t.LIMIT_SLIP:
+        return
+    most = case.car.friction_brake.max_torque_nm
+    axles = case.axles()
+    possible = sum(2.0 * case.conversion(wheels) * most for wheels, *_, gated in axles if not gated)
+    owed = max(case.m.power_demand_w, -possible)
+    if any(motor > 0.0 and brake == -most for _, motor, brake, *_ in axles):
+        return  # a full brake has nothing left to hold against a motor on its way down from driving
+    slack = POWER_SLACK_W + 1e-9 * abs(owed)
+    assert case.delivered_w() <= owed + slack
+    # More than asked is only what a regenerating motor still does on its way to zero.
+    if not any(brake == 0.0 and before < motor < 0.0 for _, motor, brake, before, *_ in axles):
+        assert case.delivered_w() >= owed - slack
+
+
+def the_battery_s_limits_hold_wherever_torque_can_help(case):
+    m, power = case.m, case.battery_w()
+    if power < -m.charge_limit_w - POWER_SLACK_W:
+        pytest.fail(f"charges with {-power} W, allowed {m.charge_limit_w} W")
+    if power > m.discharge_limit_w + POWER_SLACK_W:
+        # Not even zero torque is within the limit.
+        assert all(motor == 0.0 for _, motor, *_ in case.axles())
+        assert power == pytest.approx(case.battery_w(0.0))
+
+
+def shares_stay_between_nothing_and_everything(case):
+    assert 0.0 <= case.command.front_share <= 1.0
+    assert 0.0 <= case.command.decided_share <= 1.0
+    if case.before.steps > 0:
+        change = abs(case.command.front_share - case.before.applied_share)
+        assert change <= case.settings.share_rate_per_s * case.m.dt_s + 1e-12
+
+
+def the_limiter_s_room_is_kept(case):
+    for i, (_, motor, brake, *_) in enumerate(case.axles()):
+        if case.braking:
+            assert -motor - brake <= case.grip_nm(i) + 1e-6
+        else:
+            assert motor <= case.grip_nm(i) + 1e-6
+
+
+def nothing_pushes_against_the_demand_but_what_is_on_its_way_to_zero(case):
+    for _, motor, _, before, *_ in case.axles():
+        assert motor <= 0.0 if case.braking and before <= 0.0 else True
+        assert motor >= 0.0 if not case.braking and before >= 0.0 else True
+
+
+def the_reasons_are_among_the_named_ones(case):
+    assert case.command.limits & ~sum(t.LIMIT_NAMES) == 0
+    bits = case.command.limits
+    assert not bits & t.LIMIT_THERMAL or bits & t.LIMIT_MOTOR
+    assert case.braking or not bits & (t.LIMIT_REGENERATION | t.LIMIT_FRICTION_BRAKE)
+
+
+def the_same_step_gives_the_same_bits(case):
+    again = law.step(case.m, case.before, case.settings, case.car, TABLE)
+    assert again == (case.command, case.after)
+
+
+def it_does_what_the_plain_law_does(case):
+    def decide(front_slip, rear_slip):
+        if case.settings.strategy == t.EQUAL:
+            return 0.5
+        if case.settings.strategy == t.PREVIEW:
+            return TABLE.schedule[min(case.before.decisions, len(TABLE.schedule) - 1)]
+        small = abs(case.m.power_demand_w) < 1.0
+        return case.before.decided_share if small else rule(case.m.power_demand_w, TABLE.rule)
+
+    axles, share, decided, bits = oracle.step(case.m, case.before, case.settings, case.car, decide)
+    command, after = case.command, case.after
+    if math.isnan(axles[0].motor + axles[1].motor):
+        return  # several answers are right; the battery's own check stands above
+
+    def near(value):
+        return pytest.approx(value, rel=1e-8, abs=1e-7)
+
+    ours = [(motor, brake) for _, motor, brake, *_ in case.axles()]
+    assert ours == [(near(a.motor), near(a.friction)) for a in axles]
+    assert command.gate == axles[0].gated + 2 * axles[1].gated
+    assert (command.front_slip, command.rear_slip) == (near(axles[0].slip), near(axles[1].slip))
+    assert (command.front_share, command.decided_share) == (near(share), near(decided))
+    assert {name for bit, name in t.LIMIT_NAMES.items() if command.limits & bit} == {t.LIMIT_NAMES[x] for x in bits}
+    for i, name in enumerate(("front", "rear")):
+        assert getattr(after, f"{name}_motor_nm") == ours[i][0]
+        assert getattr(after, f"{name}_total_nm") == near(sum(ours[i]))
+        assert getattr(after, f"{name}_speed_radps") == near(axles[i].speed)
+        assert getattr(after, f"{name}_road_nm") == near(axles[i].road)
+        assert getattr(after, f"{name}_slip") == getattr(command, f"{name}_slip")
+        heat, tau = getattr(case.before, f"{name}_heat"), case.car.motor.thermal_time_constant_s
+        target = (ours[i][0] / case.car.motor.continuous_torque_nm) ** 2
+        assert getattr(after, f"{name}_heat") == near(oracle.low_pass(heat, target, case.m.dt_s, tau))
+    assert (after.decided_share, after.applied_share) == (command.decided_share, command.front_share)
+    assert after.steps == case.before.steps + 1
+    taken = case.before.steps == 0 or (
+        case.before.decision_age_s + 1.5 * case.m.dt_s >= case.settings.decision_period_s
+    )
+    assert after.decisions == case.before.decisions + taken
+    assert after.decision_age_s == near(0.0 if taken else case.before.decision_age_s + case.m.dt_s)
+
+
+CHECKS = (
+    every_number_is_finite,
+    the_motors_stay_within_torque_and_power,
+    regeneration_stays_within_its_limit_and_fades_at_low_speed,
+    friction_brakes_only_brake_and_only_on_demand,
+    left_and_right_get_the_same,
+    a_gated_axle_has_no_torque_at_all,
+    torque_grows_no_faster_than_its_rate,
+    torque_falls_no_faster_than_its_rate_but_by_a_gate_or_a_limit,
+    without_gate_and_limit_the_torques_sum_to_the_demand,
+    braking_always_gets_through,
+    the_battery_s_limits_hold_wherever_torque_can_help,
+    shares_stay_between_nothing_and_everything,
+    the_limiter_s_room_is_kept,
+    nothing_pushes_against_the_demand_but_what_is_on_its_way_to_zero,
+    the_reasons_are_among_the_named_ones,
+    the_same_step_gives_the_same_bits,
+    it_does_what_the_plain_law_does,
+)
+
+
+@settings(max_examples=EXAMPLES)
+@given(case=CASES)
+def test_all_of_it_holds_in_any_step(case):
+    for check in CHECKS:
+        check(case)
+
+
+@settings(max_examples=EXAMPLES)
+@given(
+    steps=st.sampled_from((0.005, 0.01, 0.1)).flatmap(lambda dt: st.lists(measurements(dt), min_size=2, max_size=8)),
+    s=tunings(),
+    car=st.sampled_from(list(CARS.values())),
+)
+def test_all_of_it_holds_from_the_first_step_on_for_any_sequence_of_measurements(steps, s, car):
+    state = initial_state()
+    for m in steps:
+        case = take(m, state, s, car)
+        for check in CHECKS:
+            check(case)
+        state = case.after
+
+
+# --- Table 2 as printed -----------------------------------------------------------------------------------------------
+
+TABLE2 = DEFAULT._replace(gate_mode=t.GATE_MODE_TABLE2, gate_hysteresis=0.0, gate_driving=False)
+
+
+@pytest.mark.parametrize(
+    ("slips", "gate", "parts"),
+    [
+        ((-0.1, -0.1), t.GATE_NONE, (0.3, 0.7)),
+        ((-0.3, -0.1), t.GATE_FRONT, (0.0, 1.0)),
+        ((-0.1, -0.3), t.GATE_REAR, (1.0, 0.0)),
+        ((-0.3, -0.3), t.GATE_BOTH, (0.0, 0.0)),
+    ],
+)
+def test_table_2_as_printed(slips, gate, parts):
+    s = TABLE2._replace(strategy=t.RULE)
+    table = TABLE._replace(rule=TABLE.rule * 0.0 + [0.0, 0.3, 0.0, 0.3])
+    m = measurement(slips=slips, demand=-4000.0)
+    command, _ = law.step(m, initial_state(), s, CAR, table)
+    assert command.gate == gate
+    assert (command.front_power_w, command.rear_power_w) == pytest.approx(tuple(-4000.0 * x for x in parts))
+
+
+@pytest.mark.parametrize("slip", [0.3, 0.9, -0.3])
+def test_table_2_as_printed_gates_no_driving_axle(slip):
+    assert take(measurement(slips=(slip, slip)), None, TABLE2).command.gate == t.GATE_NONE
+
+
+def test_driving_slip_is_gated_too_where_that_is_asked_for():
+    s = TABLE2._replace(gate_driving=True)
+    assert take(measurement(slips=(0.3, 0.1)), None, s).command.gate == t.GATE_FRONT
+    assert take(measurement(slips=(0.1, 0.3)), None, s).command.gate == t.GATE_REAR
+    assert take(measurement(slips=(-0.3, -0.3)), None, s).command.gate == t.GATE_NONE
+
+
+def test_the_gate_looks_at_the_worse_wheel_of_an_axle():
+    rolling = 15.0 / RADIUS
+    m = measurement(demand=-4000.0, wheel_speed_radps=(rolling, 0.7 * rolling, rolling, rolling))
+    assert take(m, None, TABLE2).command.gate == t.GATE_FRONT
+
+
+def test_an_axle_is_freed_only_when_its_slip_is_back_inside_by_the_hysteresis():
+    s = TABLE2._replace(gate_hysteresis=0.05)
+    gates, state = [], initial_state()
+    for slip in (-0.1, -0.19, -0.21, -0.19, -0.16, -0.14, -0.19):
+        case = take(measurement(slips=(slip, 0.0), demand=-4000.0), state, s)
+        gates.append(case.command.gate)
+        state = case.after
+    assert gates == [0, 0, t.GATE_FRONT, t.GATE_FRONT, t.GATE_FRONT, 0, 0]
+
+
+def test_a_gate_cuts_at_once_and_the_way_back_is_slew_limited():
+    before = settle(measurement(demand=-6000.0), TABLE2).after
+    assert before.front_motor_nm < -20.0
+    slow = TABLE2._replace(slew_regeneration_nmps=1000.0)
+    gated = take(measurement(demand=-6000.0, slips=(-0.3, 0.0)), before, slow)
+    assert gated.command.motor_torque_nm[0] == 0.0
+    freed = take(measurement(demand=-6000.0), gated.after, slow)
+    assert freed.command.motor_torque_nm[0] == pytest.approx(-10.0)
+
+
+# --- Limits, one by one ------------------------------------------------------------------------------------------------
+
+
+def test_equal_split_at_ease_gives_each_motor_a_quarter():
+    case = settle(measurement(demand=6000.0))
+    assert case.command.motor_torque_nm == pytest.approx((6000.0 / 4.0 / (15.0 / RADIUS),) * 4)
+    assert case.command.limits == 0
+    assert case.command.front_share == 0.5
+
+
+def test_what_one_axle_s_motors_cannot_give_the_other_s_do():
+    s = DEFAULT._replace(strategy=t.RULE)
+    table = TABLE._replace(rule=TABLE.rule * 0.0 + [0.0, 1.0, 0.0, 1.0])
+    state = initial_state()
+    for _ in range(100):
+        command, state = law.step(measurement(demand=22e3), state, s, CAR, table)
+    assert command.front_power_w == pytest.approx(15e3)
+    assert command.rear_power_w == pytest.approx(7e3)
+    assert command.limits == t.LIMIT_MOTOR
+
+
+def test_a_hot_motor_gives_its_continuous_torque_and_says_so():
+    hot = initial_state()._replace(steps=1, front_heat=1.0, rear_heat=1.0, applied_share=0.5)
+    m = measurement(speed=5.0, demand=10e3)
+    case = take(m, hot)
+    for _ in range(100):
+        case = take(m, case.after._replace(front_heat=1.0, rear_heat=1.0))
+    assert case.command.motor_torque_nm == pytest.approx((80.0,) * 4)
+    assert case.command.limits == t.LIMIT_MOTOR | t.LIMIT_THERMAL
+
+
+def test_hard_braking_is_shared_by_motors_and_friction_brakes():
+    case = settle(measurement(demand=-16e3), DEFAULT._replace(gate_mode=t.GATE_MODE_OFF))
+    assert case.command.motor_torque_nm == pytest.approx((-80.0,) * 4)
+    assert sum(case.command.friction_torque_nm) == pytest.approx(-16e3 / (15.0 / RADIUS) + 320.0)
+    assert case.command.limits == t.LIMIT_REGENERATION
+
+
+def test_regeneration_fades_out_between_its_two_speeds_and_friction_takes_over():
+    off = DEFAULT._replace(gate_mode=t.GATE_MODE_OFF)
+    motors = {v: settle(measurement(speed=v, demand=-9000.0), off).command.motor_torque_nm[0] for v in (3.0, 2.0, 1.0)}
+    assert motors[3.0] == pytest.approx(-80.0)
+    assert motors[2.0] == pytest.approx(-40.0)
+    assert motors[1.0] == 0.0
+
+
+def test_a_full_battery_takes_nothing_and_the_friction_brakes_brake_alone():
+    case = settle(measurement(demand=-6000.0, charge=0.0))
+    assert case.battery_w() >= 0.0
+    assert case.delivered_w() == pytest.approx(-6000.0)
+    assert case.command.limits & t.LIMIT_BATTERY_CHARGE
+
+
+def test_an_empty_battery_drives_no_motor():
+    case = settle(measurement(demand=6000.0, discharge=0.0))
+    assert case.command.motor_torque_nm == (0.0,) * 4
+    assert case.command.limits & t.LIMIT_BATTERY_DISCHARGE
+
+
+def test_an_empty_battery_is_still_charged_by_braking():
+    case = settle(measurement(demand=-6000.0, discharge=0.0))
+    assert case.battery_w() < -3000.0
+    assert case.command.limits == 0
+
+
+@pytest.mark.parametrize(("demand", "limits"), [(6000.0, {"discharge": 2000.0}), (-6000.0, {"charge": 2000.0})])
+def test_a_small_battery_gives_and_takes_exactly_its_limit(demand, limits):
+    case = settle(measurement(demand=demand, **limits))
+    assert case.battery_w() == pytest.approx(math.copysign(2000.0, demand), rel=1e-6)
+
+
+def test_two_closed_limits_switch_the_motors_off():
+    for demand in (6000.0, -6000.0):
+        case = settle(measurement(demand=demand, charge=0.0, discharge=0.0))
+        assert case.command.motor_torque_nm == (0.0,) * 4
+
+
+def test_braking_gets_through_while_the_motors_still_come_down_from_driving():
+    slow = DEFAULT._replace(slew_down_nmps=500.0)
+    driving = settle(measurement(demand=8000.0), slow).after
+    case = take(measurement(demand=-3000.0), driving, slow)
+    assert case.command.motor_torque_nm[0] > 30.0
+    assert case.delivered_w() == pytest.approx(-3000.0)
+    assert case.command.limits & t.LIMIT_SLEW
+
+
+def test_friction_fills_in_while_regeneration_grows():
+    slow = DEFAULT._replace(slew_regeneration_nmps=100.0)
+    case = take(measurement(demand=-3000.0), settle(measurement(demand=0.0), slow).after, slow)
+    assert case.command.motor_torque_nm[0] == pytest.approx(-1.0)
+    assert case.delivered_w() == pytest.approx(-3000.0)
+
+
+def test_a_brake_pedal_at_rest_holds_the_car_by_friction_alone():
+    case = settle(measurement(speed=0.0, demand=-600.0))
+    assert case.command.motor_torque_nm == (0.0,) * 4
+    assert case.command.friction_torque_nm == pytest.approx((-600.0 * RADIUS / 4.0,) * 4)
+
+
+def test_the_friction_brakes_own_limit_is_kept_and_said():
+    off = DEFAULT._replace(gate_mode=t.GATE_MODE_OFF)
+    case = settle(measurement(demand=-1e6), off)
+    assert [a + b for a, b in zip(*case.command[:2], strict=True)] == pytest.approx([-900.0] * 4)
+    assert case.command.limits & t.LIMIT_FRICTION_BRAKE
+
+
+# --- The slip limiter, with the wheel and the tyre it steers ---------------------------------------------------------
+
+
+@pytest.mark.parametrize(("demand", "friction"), [(-60e3, 0.5), (-60e3, 0.2), (30e3, 0.2), (30e3, 0.1)])
+def test_the_limiter_holds_the_wheel_at_its_target_slip(demand, friction):
+    """Wheels at a constant 15 m/s on tyres that give far less than is asked for."""
+    speed, dt = 15.0, 0.01
+    load = CAR.chassis.mass_kg * G / 4.0
+    wheel, slips, gates, state = speed / RADIUS, [], [], initial_state()
+    for _ in range(150):
+        m = measurement(demand=demand, wheel_speed_radps=(wheel,) * 4)
+        case = take(m, state)
+        state = case.after
+        torque = case.command.motor_torque_nm[0] + case.command.friction_torque_nm[0]
+        for _ in range(20):
+            x = oracle.slip(wheel, speed, RADIUS, 0.5)
+            road = RADIUS * load * friction_coefficient(x, friction, CAR.tyre)
+            wheel = max(wheel + dt / 20 * (torque - road) / CAR.wheel.inertia_kgm2, 0.0)
+        slips.append(oracle.slip(wheel, speed, RADIUS, 0.5))
+        gates.append(case.command.gate)
+    assert slips[-1] == pytest.approx(math.copysign(0.15, demand), abs=0.01)
+    assert max(map(abs, slips)) < 0.2
+    assert set(gates) == {t.GATE_NONE}
+    assert case.command.limits & t.LIMIT_SLIP

@@ -1,0 +1,80 @@
+"""Slip of an axle, its filter, the road's torque and the limiter's room, against plain Python and by hand."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iwm_power_manager.control.slip import UNLIMITED_NM, axle_slip, filtered, road_torque_nm, torque_room_nm
+from oracles import control_law as oracle
+from oracles.physics import slip
+
+RADIUS, INERTIA = 0.33, 1.1
+
+
+@given(st.floats(-50.0, 200.0), st.floats(-50.0, 200.0), st.floats(0.0, 60.0), st.sampled_from([0.5, 1.0]))
+def test_the_worse_wheel_speaks_for_its_axle(left, right, speed, floor):
+    both = [slip(w, speed, RADIUS, floor) for w in (left, right)]
+    ours = axle_slip(left, right, speed, RADIUS, floor)
+    assert ours in both
+    assert abs(ours) == max(map(abs, both))
+
+
+def test_of_two_equally_bad_wheels_the_right_one_counts():
+    assert axle_slip(0.0, 20.0 / RADIUS, 10.0, RADIUS, 1.0) == -1.0
+    assert axle_slip(20.0 / RADIUS, 0.0, 10.0, RADIUS, 1.0) == -1.0
+    assert axle_slip(0.5 / RADIUS, 1.5 / RADIUS, 1.0, RADIUS, 5.0) == pytest.approx(0.1)
+
+
+@given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.001, 0.1), st.sampled_from([0.0, 0.02, 1.0]))
+def test_the_filter_is_an_implicit_first_order_lag(before, value, dt, constant):
+    assert filtered(before, value, dt, constant) == pytest.approx(oracle.low_pass(before, value, dt, constant), abs=1e-12)
+
+
+def test_a_filter_covers_63_percent_of_a_step_in_its_time_constant():
+    value = 0.0
+    for _ in range(1000):
+        value = filtered(value, 1.0, 1e-4, 0.1)
+    assert value == pytest.approx(1.0 - math.exp(-1.0), abs=1e-3)
+
+
+def test_the_road_takes_what_does_not_turn_the_wheel():
+    assert road_torque_nm(50.0, 30.0, 30.0, 0.01, INERTIA) == 50.0
+    # 20 N m speed the wheel up by 0.1818 rad/s in 0.01 s; the other 30 went into the road.
+    assert road_torque_nm(50.0, 30.0, 30.0 + 20.0 * 0.01 / INERTIA, 0.01, INERTIA) == pytest.approx(30.0)
+
+
+SETTINGS = st.builds(
+    SimpleNamespace,
+    slip_target=st.sampled_from([0.15, 0.05]),
+    slip_limiter_s=st.sampled_from([0.03, 0.1]),
+    slip_speed_floor_mps=st.sampled_from([0.5, 1.0]),
+)
+VEHICLE = SimpleNamespace(wheel=SimpleNamespace(radius_m=RADIUS, inertia_kgm2=INERTIA))
+
+
+@given(st.booleans(), st.floats(-500.0, 500.0), st.floats(-20.0, 200.0), st.one_of(st.floats(0.0, 3.0), st.floats(0.0, 60.0)), SETTINGS)
+def test_the_room_is_the_road_s_torque_and_what_turns_the_wheel_to_its_target(braking, road, wheel, speed, s):
+    room = torque_room_nm(
+        braking, road, wheel, speed, s.slip_target, s.slip_limiter_s, s.slip_speed_floor_mps, RADIUS, INERTIA
+    )
+    expected = oracle.grip(braking, road, wheel, speed, s, VEHICLE)
+    if math.isinf(expected):
+        assert room == UNLIMITED_NM
+    else:
+        assert room == pytest.approx(expected, rel=1e-9, abs=1e-9)
+        assert room >= 0.0
+
+
+def test_brakes_can_always_hold_a_car_at_rest():
+    assert torque_room_nm(True, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == UNLIMITED_NM
+    assert torque_room_nm(True, 0.0, 0.0, 1.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) < UNLIMITED_NM
+
+
+def test_a_car_at_rest_can_start():
+    # 0.3 m/s of slip speed within 0.03 s.
+    assert torque_room_nm(False, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == pytest.approx(0.3 / RADIUS * INERTIA / 0.03)

@@ -1,0 +1,83 @@
+"""Strategies in plain Python: every share tried, the cheapest taken."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+
+from oracles.physics import axle_w, battery_w, normal_forces, road_load, torque_limit
+from oracles.step import electrical_w
+
+MISSING_PRICE = 20.0
+TELLS_APART_W = 1e-3
+
+
+def split_w(force, speed, share, friction, slip_aware, vehicle):
+    """Battery power for a road force at a share, and the force nobody can give."""
+    car, motor, radius = vehicle.chassis, vehicle.motor, vehicle.wheel.radius_m
+    rolling = speed / radius
+    if force == 0.0:
+        return battery_w(4.0 * electrical_w(0.0, rolling, motor), vehicle.battery), 0.0
+    mass = car.mass_kg + 4.0 * vehicle.wheel.inertia_kgm2 / radius**2
+    normal = normal_forces((force - road_load(speed, 0.0, car)) / mass, speed, 0.0, car)
+    direction = 1.0 if force > 0.0 else -1.0
+    asked = [share * force, force - share * force]
+    if 0.0 in asked:
+        idle = asked.index(0.0)
+        if motor.idle_drive == 1:
+            drag = motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * rolling
+            asked[1 - idle] += 2.0 * drag / radius
+    asked = [max(direction * x, 0.0) for x in asked]
+    room = [0.99 * 2.0 * friction * vehicle.tyre.peak_factor * n if slip_aware else 1e12 for n in normal]
+    if direction > 0.0:
+        room = [min(x, 2.0 * torque_limit(rolling, 0.0, motor) / radius) for x in room]
+    given = [min(a, r) for a, r in zip(asked, room, strict=True)]
+    for axle in (1, 0):
+        short = sum(asked) - sum(given)
+        given[axle] += min(max(short, 0.0), room[axle] - given[axle])
+    power = sum(
+        axle_w(direction * f, speed, n, friction, slip_aware, vehicle) for f, n in zip(given, normal, strict=True)
+    )
+    return battery_w(power, vehicle.battery), sum(asked) - sum(given)
+
+
+def cheapest(demand, speed, previous, friction, slip_aware, switching, vehicle, shares):
+    """Least battery power, what is missing priced, a change of share worth it only beyond `switching`."""
+    rolling = max(speed, vehicle.driver.power_speed_floor_mps)
+    force = demand / rolling
+
+    def price(share):
+        power, missing = split_w(force, rolling, share, friction, slip_aware, vehicle)
+        return power + MISSING_PRICE * missing * rolling
+
+    costs = {previous: price(previous) - TELLS_APART_W}
+    for share in shares:
+        costs.setdefault(share, price(share) + switching)
+    return min(costs, key=costs.__getitem__), costs
+
+
+def rule(demand, coefficients):
+    """Straight lines P_f(P_dem)."""
+    a, b = coefficients[:2] if demand > 0.0 else coefficients[2:]
+    return float(np.clip((a + b * demand) / demand, 0.0, 1.0))
+
+
+def interpolated(axes, table, point):
+    """Multilinear, the edge's value outside; axes of a single point do not count."""
+    kept = [i for i, axis in enumerate(axes) if len(axis) > 1]
+    values = table.reshape([len(axes[i]) for i in kept])
+    inside = [float(np.clip(point[i], axes[i][0], axes[i][-1])) for i in kept]
+    return float(RegularGridInterpolator([axes[i] for i in kept], values)(inside)[0]) if kept else float(values)
+
+
+def bellman(point, previous, table, outcome):
+    """Cost of each share: step, change, and what follows (eq. 31). `outcome(share)` is the step's (cost, v, f, r)."""
+    axes = (table.power_w, table.speed_mps, table.slip_front, table.slip_rear, table.previous_share)
+    costs = {}
+    for share in (previous, *table.share):
+        cost, speed, front, rear = outcome(share)
+        follow_up = interpolated(axes, table.expected_cost_j, (point[0], speed, front, rear, share))
+        changed = table.switching_cost_j * abs(share - previous) + table.switching_fixed_cost_j * (share != previous)
+        costs.setdefault(share, cost + changed + table.discount * follow_up)
+    costs[previous] -= TELLS_APART_W * table.problem.dt_s
+    return costs
