@@ -10,20 +10,22 @@ from __future__ import annotations
 import enum
 import gc
 import math
+import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -412,18 +414,24 @@ class Simulator(Node):
         self.done.set_exception(error)
 
 
+def _interrupted(_number: int, _frame: Any) -> NoReturn:
+    raise KeyboardInterrupt
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Drive the cycle; returns the exit code: 0 at its end or on Ctrl-C, 1 with one line on an error."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupted)
     try:
-        rclpy.init(args=list(args) if args is not None else None)
+        # rclpy's own handlers would close DDS under a callback that is publishing.
+        rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
         node = Simulator()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         executor.spin_until_future_complete(node.done)
-        if node.done.done():
-            node.done.result()
+        node.done.result()
         node.destroy_node()
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except KeyboardInterrupt:
         pass
     except (IwmError, RuntimeError) as error:  # RuntimeError: rcl's only word for a wrong --ros-args
         print(f"simulator: {' '.join(str(error).split())}", file=sys.stderr)

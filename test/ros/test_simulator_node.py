@@ -1,0 +1,352 @@
+"""The simulator as a process of its own, with a stand-in for the power manager in this one."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from bench import Bench, Running, arguments
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.files import read_yaml
+from iwm_power_manager.ros import messages as m
+from iwm_power_manager.ros import qos
+from iwm_power_manager.share import resolve
+from iwm_power_manager.vehicle import load_vehicle
+from iwm_sim.drive import Drive, load_run
+from iwm_sim.simulator import PARAMETERS
+
+MODULE = "iwm_sim.simulator"
+DOMAIN = int(os.environ["ROS_DOMAIN_ID"])
+NAMES = m.WHEEL_NAMES
+STAMPED = {
+    m.VEHICLE_SPEED: lambda message: m.read_vehicle_speed(message).stamp_ns,
+    m.WHEEL_STATES: lambda message: m.read_wheel_speeds(message).stamp_ns,
+    m.BATTERY_STATE: lambda message: m.read_battery_state(message).stamp_ns,
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_drive(hill: Path) -> None:
+    """Compile the drive once, before processes are started that have to answer in time."""
+    vehicle = load_vehicle(resolve("config/vehicles/jalalmaab_2015.yaml"))
+    Drive(vehicle, load_cycle(hill), friction=0.9, initial_soc=0.8, dt_s=0.02)
+
+
+@pytest.fixture(scope="module")
+def hill(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short cycle: up to 6 m/s and back."""
+    path = tmp_path_factory.mktemp("cycle") / "hill.csv"
+    path.write_text("time_s,speed_mps\n0,0\n4,6\n6,6\n9,0\n10,0\n")
+    return path
+
+
+class StandIn:
+    """Listens to the simulator, and commands what `policy` makes of a set: motor and friction torques, or None."""
+
+    count = 0
+
+    def __init__(self, folder: Path, *, lockstep: bool, **parameters: Any) -> None:
+        StandIn.count += 1
+        self.namespace = f"/simulated_{os.getpid()}_{StandIn.count}"
+        self.result = folder / "drive.npz"
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context, domain_id=DOMAIN, args=[])
+        self.node = Node("stand_in", context=self.context, namespace=self.namespace, enable_rosout=False)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        profile = qos.profile(lockstep=lockstep)
+        self.motors = self.node.create_publisher(m.JointState, m.WHEEL_TORQUE_COMMAND, profile)
+        self.brakes = self.node.create_publisher(m.JointState, m.FRICTION_BRAKE_COMMAND, profile)
+        self.received: dict[str, list[Any]] = {}
+        everything = qos.profile(lockstep=True)
+        for topic, kind in m.TOPIC_TYPES.items():
+            name = f"{self.namespace}/clock" if topic == m.CLOCK else topic
+            self.received[topic] = []
+            self.node.create_subscription(kind, name, self._keeper(topic), everything)
+        self.answer: Callable[[int, float, float], None] = self.obey
+        values = {"result_file": self.result, "lockstep": lockstep, "answer_timeout_s": 30.0, **parameters}
+        remaps = {"__ns": self.namespace, "/clock": f"{self.namespace}/clock"}
+        self.running = Running(MODULE, arguments(values, remaps), DOMAIN, folder)
+
+    def _keeper(self, topic: str) -> Callable[[Any], None]:
+        def keep(message: Any) -> None:
+            self.received[topic].append(message)
+            if topic == m.POWER_DEMAND:
+                speed = m.read_vehicle_speed(self.received[m.VEHICLE_SPEED][-1])
+                self.answer(speed.stamp_ns, speed.speed_mps, message.data)
+
+        return keep
+
+    def obey(self, stamp_ns: int, speed_mps: float, power_w: float) -> None:
+        """Equal torque on all wheels, motors driving and brakes braking."""
+        torque = power_w / (max(speed_mps, 1.0) / 0.33) / 4.0
+        self.command(stamp_ns, (max(torque, 0.0),) * 4, (min(torque, 0.0),) * 4)
+
+    def command(self, stamp_ns: int, motor: tuple[float, ...], friction: tuple[float, ...], names: Any = NAMES) -> None:
+        self.motors.publish(m.torque_command_message(stamp_ns, names, motor))
+        self.brakes.publish(m.torque_command_message(stamp_ns, names, friction))
+
+    def finish(self) -> int:
+        """Serve until the simulator has ended; returns its exit code."""
+        Bench.spin_until(self, lambda: self.running.process.poll() is not None, "the simulator to end")
+        return self.running.wait()
+
+    def run(self) -> tuple[Any, dict[str, Any]]:
+        assert self.finish() == 0, self.running.text()
+        return load_run(self.result)
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+        self.running.process.kill()
+        self.running.process.wait()
+
+
+@pytest.fixture
+def stand_in(tmp_path: Path, hill: Path) -> Iterator[Callable[..., StandIn]]:
+    started: list[StandIn] = []
+
+    def start(*, lockstep: bool = True, **parameters: Any) -> StandIn:
+        started.append(StandIn(tmp_path, lockstep=lockstep, **{"cycle_file": hill, **parameters}))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.close()
+
+
+def stamps(stand_in: StandIn, topic: str) -> list[int]:
+    return [STAMPED[topic](message) for message in stand_in.received[topic]]
+
+
+# --- lock-step ------------------------------------------------------------------------------------------------------
+
+
+def test_each_step_of_a_lockstep_drive_is_one_set_with_one_stamp(stand_in) -> None:
+    pair = stand_in(rate_hz=50.0)
+    run, notes = pair.run()
+    expected = [20_000_000 * (step + 1) for step in range(500)]
+    for topic in STAMPED:
+        assert stamps(pair, topic) == expected
+    assert [m.stamp_to_ns(message.clock) for message in pair.received[m.CLOCK]] == expected
+    assert [message.data for message in pair.received[m.POWER_DEMAND]] == run["power_demand_w"].tolist()
+    assert notes["published"] == {
+        m.CLOCK: 500,
+        m.ACCELERATOR_PEDAL: 100,
+        m.BRAKE_PEDAL: 100,
+        m.VEHICLE_SPEED: 500,
+        m.WHEEL_STATES: 500,
+        m.BATTERY_STATE: 500,
+        m.POWER_DEMAND: 500,
+    }
+    assert run["speed_mps"].max() == pytest.approx(6.0, abs=0.3)
+
+
+def test_topics_show_the_car_as_it_is(stand_in) -> None:
+    pair = stand_in(rate_hz=50.0)
+    run, _ = pair.run()
+    speeds = [m.read_vehicle_speed(message).speed_mps for message in pair.received[m.VEHICLE_SPEED]]
+    np.testing.assert_array_equal(speeds, run["speed_mps"])
+    wheels = [m.read_wheel_speeds(message).values for message in pair.received[m.WHEEL_STATES]]
+    np.testing.assert_array_equal(np.array(wheels)[:, 0], run["front_wheel_radps"])
+    # What the motors did in a step is shown at the next one.
+    efforts = np.array([message.effort for message in pair.received[m.WHEEL_STATES]])
+    np.testing.assert_array_equal(efforts[1:, 2], run["rear_motor_nm"][:-1])
+    batteries = [m.read_battery_state(message) for message in pair.received[m.BATTERY_STATE]]
+    np.testing.assert_array_equal([battery.soc for battery in batteries], run["soc"].astype(np.float32))
+    assert batteries[200].discharge_current_a > 5.0
+    assert batteries[200].voltage_v == pytest.approx(240.0, abs=15.0)
+    pedals = [message.data for message in pair.received[m.ACCELERATOR_PEDAL]]
+    np.testing.assert_array_equal(pedals, run["accelerator"][::5])
+
+
+def test_commands_are_matched_by_wheel_name(stand_in) -> None:
+    pair = stand_in(rate_hz=50.0, until_s=1.0)
+    pair.answer = lambda stamp, *_: pair.command(
+        stamp, (40.0, 30.0, 20.0, 10.0), (0.0,) * 4, ("rear_right", "rear_left", "front_right", "front_left")
+    )
+    run, _ = pair.run()
+    assert (run["front_motor_nm"] == 10.0).all()
+    assert (run["rear_motor_nm"] == 30.0).all()
+
+
+def test_a_set_without_an_answer_is_sent_again_and_stepped_once(stand_in) -> None:
+    pair = stand_in(rate_hz=50.0, until_s=1.0, resend_after_s=0.1)
+    deaf = {20_000_000 * 10, 20_000_000 * 30}
+
+    def answer(stamp_ns: int, *rest: float) -> None:
+        if stamp_ns in deaf:
+            deaf.remove(stamp_ns)
+        else:
+            pair.obey(stamp_ns, *rest)
+
+    pair.answer = answer
+    run, notes = pair.run()
+    assert notes["resent"] >= 2
+    assert len(run.series) == 50
+    assert len(set(stamps(pair, m.VEHICLE_SPEED))) == 50
+    assert notes["published"][m.VEHICLE_SPEED] == 50 + notes["resent"]
+
+
+def test_commands_that_are_late_or_broken_change_nothing(stand_in) -> None:
+    pair = stand_in(rate_hz=50.0, until_s=1.0)
+
+    def answer(stamp_ns: int, *_: float) -> None:
+        pair.command(stamp_ns - 20_000_000, (99.0,) * 4, (0.0,) * 4)
+        pair.command(stamp_ns, (float("nan"), 1.0, 1.0, 1.0), (0.0,) * 4)
+        pair.command(stamp_ns, (99.0,) * 3, (0.0,) * 3, NAMES[:3])
+        pair.command(stamp_ns, (5.0,) * 4, (0.0,) * 4)
+
+    pair.answer = answer
+    run, _ = pair.run()
+    assert (run["front_motor_nm"] == 5.0).all()
+
+
+def test_without_an_answer_it_ends_with_one_clear_line(stand_in) -> None:
+    pair = stand_in(rate_hz=50.0, resend_after_s=0.2, answer_timeout_s=0.5)
+    pair.answer = lambda *_: None
+    assert pair.finish() == 1
+    last = pair.running.text().splitlines()[-1]
+    assert last.startswith(
+        "simulator: no wheel_torque_command and friction_brake_command with stamp 0.020 s within 0.5 s"
+    )
+
+
+def test_with_a_recorder_expected_it_waits_for_its_word(stand_in) -> None:
+    pair = stand_in(rate_hz=50.0, until_s=0.2, wait_for_recorder=True, partner_timeout_s=3.0)
+    assert pair.finish() == 1
+    last = pair.running.text().splitlines()[-1]
+    assert "no second subscription of" in last
+    assert last.endswith("no word from the recorder that it is ready")
+
+
+# --- real time ------------------------------------------------------------------------------------------------------
+
+
+def test_faster_than_real_time_it_publishes_the_clock_and_reaches_the_end(stand_in) -> None:
+    pair = stand_in(lockstep=False, rate_hz=50.0, speed_factor=5.0, command_timeout_s=5.0)
+    run, notes = pair.run()
+    assert len(run.series) == 500
+    clock = [m.stamp_to_ns(message.clock) for message in pair.received[m.CLOCK]]
+    assert clock == sorted(set(clock))
+    assert notes["published"][m.CLOCK] == 500
+    assert run["speed_mps"].max() > 3.0
+
+
+def test_in_real_time_there_is_no_clock_and_stamps_are_the_systems_time(stand_in) -> None:
+    pair = stand_in(lockstep=False, rate_hz=50.0, until_s=1.0)
+    before = pair.node.get_clock().now().nanoseconds
+    run, _ = pair.run()
+    after = pair.node.get_clock().now().nanoseconds
+    assert pair.received[m.CLOCK] == []
+    assert before < stamps(pair, m.VEHICLE_SPEED)[0] <= stamps(pair, m.VEHICLE_SPEED)[-1] < after
+    assert len(run.series) == 50
+
+
+def test_commands_that_stop_leave_motors_off_and_brakes_at_the_pedal(stand_in) -> None:
+    pair = stand_in(lockstep=False, rate_hz=50.0, speed_factor=4.0, command_timeout_s=1.0)
+
+    def answer(stamp_ns: int, *rest: float) -> None:
+        # The power manager falls silent while the car is fast.
+        if stamp_ns < 5_500_000_000:
+            pair.obey(stamp_ns, *rest)
+
+    pair.answer = answer
+    run, notes = pair.run()
+    # Silent at 5.5 s and 1 s of patience: by 7.5 s, a second later, everything of the last command is gone.
+    late = run["time_s"] > 7.5
+    assert notes["command_timeouts"] >= 1
+    assert (run["front_motor_nm"][late] == 0.0).all()
+    braking = late & (run["brake"] > 0.1) & (run["speed_mps"] > 1.0)
+    assert braking.any()
+    assert (run["front_friction_nm"][braking] < -10.0).all()
+    assert run["speed_mps"][-1] < 0.2
+    assert "motors off, brakes follow the pedal" in pair.running.text()
+
+
+# --- alone ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parameters", "expected"),
+    [
+        ({"cycle_file": "/nowhere/cycle.csv"}, "/nowhere/cycle.csv: cannot be read"),
+        ({"vehicle_file": "/nowhere/car.yaml"}, "/nowhere/car.yaml: cannot be read"),
+        ({"friction": 7.0}, "parameter friction: 7.0 is not allowed; allowed: 0.05 to 1.5"),
+        ({"friction": ".nan"}, "parameter friction: nan is not allowed"),
+        ({"rate_hz": "fast"}, "parameter rate_hz: 'fast' is not allowed"),
+        ({"idle_drive": "sleeping"}, "parameter idle_drive: 'sleeping' is not allowed"),
+        ({"partner_timeout_s": 0.2}, "after 0.2 s there is still no subscription of"),
+    ],
+)
+def test_what_it_cannot_work_with_gives_one_line_and_exit_code_1(tmp_path, parameters, expected) -> None:
+    running = Running(MODULE, arguments(parameters, {"__ns": f"/alone_{os.getpid()}"}), DOMAIN, tmp_path)
+    assert running.wait() == 1
+    lines = [line for line in running.text().splitlines() if not line.startswith("[INFO]")]
+    assert len(lines) == 1, running.text()
+    assert expected in lines[0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_cleanly(stand_in, number) -> None:
+    pair = stand_in(rate_hz=50.0)
+    Bench.spin_until(pair, lambda: len(pair.received[m.POWER_DEMAND]) > 20, "the drive")
+    assert pair.running.stop(number) == 0
+    assert "Traceback" not in pair.running.text()
+
+
+def test_topics_follow_namespace_and_remaps(tmp_path, hill) -> None:
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN, args=[])
+    node = Node("onlooker", context=context, enable_rosout=False)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    space = f"/car_{os.getpid()}"
+    running = Running(
+        MODULE,
+        arguments({"cycle_file": hill}, {"__ns": space, "vehicle_speed": "speed_over_ground", "__node": "virtual_car"}),
+        DOMAIN,
+        tmp_path,
+    )
+    try:
+        bench = type("Spinner", (), {"executor": executor})()
+        expected = {f"{space}/speed_over_ground", f"{space}/wheel_states", f"{space}/power_demand"}
+        Bench.spin_until(
+            bench,
+            lambda: (
+                expected <= {name for name, _ in node.get_publisher_names_and_types_by_node("virtual_car", space)}
+                if ("virtual_car", space) in node.get_node_names_and_namespaces()
+                else False
+            ),
+            "the renamed topics",
+        )
+        assert running.stop() == 0
+    finally:
+        running.process.kill()
+        running.process.wait()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+
+
+def test_the_shipped_parameter_file_holds_its_defaults() -> None:
+    given = read_yaml(resolve("config/nodes/simulator.yaml"))["/**/simulator"]["ros__parameters"]
+    defaults = {spec.name: spec.default for spec in PARAMETERS}
+    assert {name: defaults[name] for name in given} == given
+
+
+def test_every_parameter_has_a_description_and_every_number_a_range() -> None:
+    for spec in PARAMETERS:
+        assert spec.description.endswith("."), spec.name
+        if isinstance(spec.default, float):
+            assert np.isfinite([spec.low, spec.high]).all(), spec.name
