@@ -14,6 +14,7 @@ holds, but never reverses it; a car that would roll backwards stands still.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from iwm_power_manager.jit import kernel
@@ -152,7 +153,12 @@ def step(
     moved = after
     coasting = after
     drag = 0.0
-    for _ in range(30):
+    # The faster the car is assumed to be, the more the tyres slow it: the root lies between what was too slow and what
+    # was too fast. Without the bracket the iteration would swing about a car that locked wheels bring to rest.
+    low = 0.0
+    high = math.inf
+    last_change = math.inf
+    for _ in range(60):
         front, rear = normal_forces_n((after - speed_mps) / dt_s, after, grade, chassis)
         w0, f0, b0 = wheel_step(
             wheel_speed_radps[0], after, motor_torque_nm[0], resisting_torque_nm[0], front, friction[0], dt_s, wheel, tyre
@@ -176,5 +182,12 @@ def step(
         change = moved - after
         if abs(change) <= 1e-10 * (1.0 + moved):
             break
-        after = max(after + change / coupling, 0.0)
+        if change > 0.0:
+            low = after
+        else:
+            high = after
+        after += change / coupling
+        if high < math.inf and (not low < after < high or abs(change) > 0.5 * last_change):
+            after = 0.5 * (low + high)
+        last_change = abs(change)
     return Motion(moved, (w0, w1, w2, w3), (f0, f1, f2, f3), (b0, b1, b2, b3), (coasting - moved) * mass / dt_s)
