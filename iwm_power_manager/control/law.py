@@ -226,8 +226,12 @@ def step(
     growth = settings.slew_regeneration_nmps
     front_slewed = slewed(state.front_motor_nm, front_motor, dt, up, down, growth)
     rear_slewed = slewed(state.rear_motor_nm, rear_motor, dt, up, down, growth)
-    front_slewed = _inside(front_slewed, front_gated, braking, front_grip, front_fast, speed, state.front_heat, vehicle)
-    rear_slewed = _inside(rear_slewed, rear_gated, braking, rear_grip, rear_fast, speed, state.rear_heat, vehicle)
+    front_heat = state.front_heat
+    rear_heat = state.rear_heat
+    front_slewed = _quiet(
+        _inside(front_slewed, front_gated, braking, front_grip, front_fast, speed, front_heat, vehicle)
+    )
+    rear_slewed = _quiet(_inside(rear_slewed, rear_gated, braking, rear_grip, rear_fast, speed, rear_heat, vehicle))
     if max(abs(front_slewed - front_motor), abs(rear_slewed - rear_motor)) > ZERO_TORQUE_NM:
         limits |= LIMIT_SLEW
 
@@ -244,8 +248,8 @@ def step(
     if scale < 1.0:
         power = car_power_w(front_slewed, rear_slewed, front_speed, rear_speed, vehicle.motor)
         limits |= LIMIT_BATTERY_CHARGE if power < 0.0 else LIMIT_BATTERY_DISCHARGE
-    front_motor = _quiet(scale * front_slewed)
-    rear_motor = _quiet(scale * rear_slewed)
+    front_motor = scale * front_slewed
+    rear_motor = scale * rear_slewed
     if braking:
         most = vehicle.friction_brake.max_torque_nm
         front_friction = _friction(front_total, front_motor, most)
