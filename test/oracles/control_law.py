@@ -185,6 +185,8 @@ def step(m, state, settings, vehicle, decide):
             settings.slew_up_nmps, settings.slew_down_nmps, settings.slew_regeneration_nmps,
         )
         axle.motor = 0.0 if axle.gated else min(max(way, -weakest), strongest)
+        if abs(axle.motor) <= NOTHING:
+            axle.motor = 0.0
         if abs(axle.motor - wanted) > NOTHING:
             bits.add(t.LIMIT_SLEW)
 
@@ -195,8 +197,6 @@ def step(m, state, settings, vehicle, decide):
         bits.add(t.LIMIT_BATTERY_CHARGE if side == "charge" else t.LIMIT_BATTERY_DISCHARGE)
     for axle in axles:
         axle.motor *= factor
-        if abs(axle.motor) <= NOTHING:
-            axle.motor = 0.0
         if braking and not axle.gated:
             # Whatever the motor does, wheel and brake together brake as asked.
             axle.friction = -min(max(axle.motor - axle.total, 0.0), brake.max_torque_nm)
