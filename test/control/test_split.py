@@ -1,0 +1,150 @@
+"""Each strategy against plain Python that tries every share."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iwm_power_manager.control import types as t
+from iwm_power_manager.control.split import cheapest_share, decide, lookahead_share, rule_share, table_share
+from iwm_power_manager.control.types import default_settings
+from iwm_power_manager.mdp.transitions import step_cost_and_next
+from iwm_power_manager.policy import empty_table
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+from oracles import splits
+
+CARS = [load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), name).params for name in ("none", "drag")]
+CAR = CARS[1]
+SHARES = [0.0, 0.25, 0.5, 0.75, 1.0]
+
+
+def _solved(previous=(0.0, 0.5, 1.0)):
+    """A table with every axis, filled at random: no optimum, but something to look up."""
+    rng = np.random.default_rng(3)
+    axes = {
+        "power_w": np.array([-8000.0, -1000.0, 0.0, 4000.0, 15000.0]),
+        "speed_mps": np.array([0.0, 5.0, 12.0, 25.0]),
+        "slip_front": np.array([-1.0, -0.1, 0.0, 0.1]),
+        "slip_rear": np.array([-0.5, 0.0, 0.5]),
+        "previous_share": np.array(previous),
+    }
+    shape = tuple(map(len, axes.values()))
+    return empty_table(SHARES, rule=(500.0, 0.3, -100.0, 0.8), schedule=(0.1, 0.9, 0.4))._replace(
+        **axes, front_share=rng.uniform(0.0, 1.0, shape), expected_cost_j=rng.uniform(0.0, 300.0, shape),
+        discount=0.95, switching_cost_j=20.0, switching_fixed_cost_j=5.0,
+    )
+
+
+TABLE = _solved()
+ONE_SHARE = _solved((0.0,))
+AXES = ("power_w", "speed_mps", "slip_front", "slip_rear", "previous_share")
+POWER = st.one_of(st.floats(2.0, 30e3), st.floats(-40e3, -2.0))
+SPEED = st.one_of(st.just(0.0), st.floats(0.0, 35.0))
+SLIP = st.floats(-1.2, 0.9)
+SHARE = st.one_of(st.sampled_from(SHARES), st.floats(0.01, 0.99))
+
+
+def within_rounding(costs, ours, slack):
+    """Whether the share is as cheap as the cheapest, but for rounding."""
+    return costs[ours] <= min(costs.values()) + slack
+
+
+@given(POWER)
+def test_the_rule_is_one_line_for_driving_and_one_for_braking(power):
+    assert rule_share(power, TABLE) == pytest.approx(splits.rule(power, TABLE.rule))
+
+
+@settings(max_examples=60)
+@given(POWER, SPEED, SHARE, st.sampled_from([0.9, 0.2]), st.booleans(), st.sampled_from([0.0, 100.0]), st.sampled_from(CARS))
+def test_the_cheapest_share_is_the_cheapest_of_all(power, speed, previous, friction, slip_aware, switching, car):
+    ours = cheapest_share(power, speed, previous, friction, slip_aware, switching, car, TABLE)
+    _, costs = splits.cheapest(power, speed, previous, friction, slip_aware, switching, car, SHARES)
+    assert ours in costs
+    assert within_rounding(costs, ours, 0.05)
+
+
+def test_a_change_has_to_save_the_switching_power():
+    def shares(switching):
+        return [cheapest_share(float(p), 12.0, 0.5, 0.9, True, switching, CARS[0], TABLE) for p in range(500, 8000, 500)]
+
+    assert set(shares(1e5)) == {0.5}
+    assert len(set(shares(0.0))) > 1
+    assert sum(s != 0.5 for s in shares(100.0)) < sum(s != 0.5 for s in shares(0.0))
+
+
+def test_at_equal_cost_the_share_stays():
+    # No loss, no drag: whatever the split, the power is the same.
+    motor = CARS[0].motor._replace(
+        loss_constant_w=0.0, loss_linear_speed=0.0, loss_quadratic_speed=0.0, loss_linear_torque=0.0, loss_quadratic_torque=0.0
+    )
+    assert cheapest_share(4000.0, 12.0, 0.37, 0.9, False, 0.0, CARS[0]._replace(motor=motor), TABLE) == 0.37
+
+
+def test_what_cannot_be_delivered_costs_more_than_any_loss():
+    # Alone, the front axle spins on ice; both together do not.
+    assert 0.0 < cheapest_share(9000.0, 10.0, 0.0, 0.2, True, 100.0, CAR, TABLE) < 1.0
+
+
+@given(st.floats(-20e3, 20e3), st.floats(0.0, 40.0), SLIP, SLIP, SHARE)
+def test_the_table_is_read_multilinearly_and_its_edge_holds_outside(power, speed, front, rear, previous):
+    for table in (TABLE, ONE_SHARE):
+        point = (power, speed, front, rear, previous)
+        known = splits.interpolated([getattr(table, name) for name in AXES], table.front_share, point)
+        assert table_share(*point, table) == pytest.approx(known, abs=1e-9)
+
+
+def test_a_share_from_a_table_stays_within_0_and_1():
+    off = TABLE._replace(front_share=TABLE.front_share * 0.0 + 1.0 + 1e-9)
+    assert table_share(1000.0, 10.0, 0.0, 0.0, 0.5, off) == 1.0
+    assert table_share(1000.0, 10.0, 0.0, 0.0, 0.5, off._replace(front_share=-off.front_share)) == 0.0
+
+
+@settings(max_examples=60)
+@given(POWER, st.floats(0.0, 30.0), st.floats(-0.15, 0.15), st.floats(-0.15, 0.15), SHARE)
+def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, rear, previous):
+    def outcome(share):
+        step = step_cost_and_next(power, speed, front, rear, share, CAR, TABLE.problem)
+        return step.cost_j, step.speed_mps, step.slip_front, step.slip_rear
+
+    ours = lookahead_share(power, speed, front, rear, previous, CAR, TABLE)
+    costs = splits.bellman((power, speed, front, rear), previous, TABLE, outcome)
+    assert within_rounding(costs, ours, 1e-6)
+
+
+def test_the_lookahead_stays_where_changing_gains_nothing():
+    flat = TABLE._replace(expected_cost_j=TABLE.expected_cost_j * 0.0, discount=0.0)
+    dear = flat._replace(switching_fixed_cost_j=1e6)
+    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, CAR, dear) == 0.3
+    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, CAR, flat._replace(switching_cost_j=1e6)) == 0.3
+    free = flat._replace(switching_cost_j=0.0, switching_fixed_cost_j=0.0)
+    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, CAR, free) in SHARES
+
+
+def choose(strategy, power=5000.0, decisions=0, previous=0.3, speed=12.0, friction=0.9):
+    s = default_settings(strategy)
+    return decide(power, speed, 0.01, -0.02, previous, friction, decisions, s, CAR, TABLE)
+
+
+def test_every_strategy_is_behind_its_name():
+    assert choose("equal") == 0.5
+    assert choose("rule") == rule_share(5000.0, TABLE)
+    assert choose("instantaneous", 1500.0) == cheapest_share(1500.0, 12.0, 0.3, 0.9, False, 0.0, CAR, TABLE)
+    assert choose("instantaneous_slip", 1500.0) == cheapest_share(1500.0, 12.0, 0.3, 0.9, True, 100.0, CAR, TABLE)
+    assert choose("sdp") == table_share(5000.0, 12.0, 0.01, -0.02, 0.3, TABLE)
+    assert choose("sdp_lookahead") == lookahead_share(5000.0, 12.0, 0.01, -0.02, 0.3, CAR, TABLE)
+    assert set(t.STRATEGIES) == {"equal", "rule", "instantaneous", "instantaneous_slip", "sdp", "sdp_lookahead", "preview"}
+
+
+def test_the_preview_plays_its_schedule_and_holds_the_last_entry():
+    assert [choose("preview", decisions=k) for k in range(5)] == [0.1, 0.9, 0.4, 0.4, 0.4]
+    assert choose("preview", power=0.0, decisions=1) == 0.9
+
+
+@pytest.mark.parametrize("strategy", ["rule", "instantaneous", "instantaneous_slip", "sdp", "sdp_lookahead"])
+@pytest.mark.parametrize("power", [0.0, 0.999, -0.999])
+def test_without_a_demand_the_split_stays_as_it_is(strategy, power):
+    assert choose(strategy, power) == 0.3
+    assert choose("equal", power) == 0.5
