@@ -6,6 +6,7 @@ A policy is one `.npz` without pickles. Its members:
 front_share            float64[P, V, F, R, S], the control of every state: P_front / P_demand
 cost_j                 float64[P, V, F, R, S], cost-to-go, J, rounded to a power of two below the tolerance
 demand_probability     float64[P, P], transition matrix of the power demand
+demand_by_speed        float64[V, P, P], the same for each speed; float64[0, P, P] if it does not depend on the speed
 demand_steps           float64[P], (weighted) steps counted in each of its rows
 metadata               JSON text as bytes: format, versions, vehicle with its hash, cycles with theirs, friction, every
                        setting of the problem (with the axes), and the solver's iterations and bound
@@ -53,7 +54,7 @@ from iwm_power_manager.vehicle import Vehicle
 FORMAT_NAME = "iwm_power_manager policy"
 FORMAT_VERSION = 1
 
-_ARRAYS = ("front_share", "cost_j", "demand_probability", "demand_steps")
+_ARRAYS = ("front_share", "cost_j", "demand_probability", "demand_by_speed", "demand_steps")
 _MEMBERS = (*_ARRAYS, "metadata", "checksum")
 _MAX_BYTES = 2**31
 #: Zip's earliest date: a file's bytes must not depend on when it was written.
@@ -141,7 +142,10 @@ class Policy:
         rows = problem.power_w.size
         cost = np.ascontiguousarray(self.cost_j).reshape(rows, -1)
         ahead = np.empty_like(cost)
-        expect_over_demand(self.chain.probability, cost, 0, cost.shape[1], ahead)
+        columns = cost.shape[1]
+        expect_over_demand(
+            self.chain.matrix, cost, columns, columns // problem.speed_mps.size, 0, columns, ahead
+        )
         return PolicyTable(
             power_w=problem.power_w,
             speed_mps=problem.speed_mps,
@@ -267,6 +271,7 @@ def _content(policy: Policy) -> tuple[dict[str, NDArray[np.float64]], bytes]:
         "front_share": policy.front_share,
         "cost_j": policy.cost_j,
         "demand_probability": policy.chain.probability,
+        "demand_by_speed": policy.chain.by_speed,
         "demand_steps": policy.chain.row_steps,
     }
     metadata = {
@@ -412,6 +417,7 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
             ("front_share", problem.shape),
             ("cost_j", problem.shape),
             ("demand_probability", (points, points)),
+            ("demand_by_speed", (problem.speed_mps.size if problem.demand_by_speed else 0, points, points)),
             ("demand_steps", (points,)),
         ):
             if arrays[name].shape != shape:
@@ -420,11 +426,14 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
                 raise PolicyError(f"{path}: {name} holds a value that is not finite")
         if np.min(arrays["front_share"]) < 0.0 or np.max(arrays["front_share"]) > 1.0:
             raise PolicyError(f"{path}: front_share holds a value outside 0 to 1")
-        probability = arrays["demand_probability"]
-        if np.min(probability) < 0.0 or np.max(np.abs(probability.sum(axis=1) - 1.0)) > 1e-9:
-            raise PolicyError(f"{path}: a row of demand_probability is no distribution")
+        probability, by_speed = arrays["demand_probability"], arrays["demand_by_speed"]
+        for name, rows in (("demand_probability", probability[None]), ("demand_by_speed", by_speed)):
+            if np.any(rows < 0.0) or np.any(np.abs(rows.sum(axis=2) - 1.0) > 1e-9):
+                raise PolicyError(f"{path}: a row of {name} is no distribution")
         solver = metadata["solver"]
-        chain = DemandChain(problem.power_w, probability, arrays["demand_steps"], float(metadata["demand"]["clipped"]))
+        chain = DemandChain(
+            problem.power_w, probability, by_speed, arrays["demand_steps"], float(metadata["demand"]["clipped"])
+        )
         return Policy(
             problem=problem,
             friction=float(metadata["friction"]),

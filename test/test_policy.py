@@ -49,7 +49,7 @@ def _solved(friction=0.5, previous_share=True):
         problem = dataclasses.replace(problem, switching_cost_j=0.0)
     source = Source("drive", "ab" * 32, 1.5, (np.array([0.0, 6000.0, 0.0, -6000.0, 0.0, 0.0]),))
     chain = demand_chain(problem.power_w, [source])
-    solution = solve(build_model(problem, CAR.params, friction, chain.probability), problem.share, 0.009)
+    solution = solve(build_model(problem, CAR.params, friction, chain.matrix), problem.share, 0.009)
     return make_policy(problem, CAR, friction, chain, [source], solution), solution
 
 
@@ -94,7 +94,7 @@ def test_the_same_policy_gives_the_same_bytes(policy, content, tmp_path):
 def test_the_file_opens_without_pickles_and_holds_what_the_documentation_says(content):
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         assert set(archive.files) == {
-            "front_share", "cost_j", "demand_probability", "demand_steps", "metadata", "checksum",
+            "front_share", "cost_j", "demand_probability", "demand_by_speed", "demand_steps", "metadata", "checksum",
         }  # fmt: skip
         metadata = json.loads(archive["metadata"].tobytes())
     assert metadata["format_version"] == 1

@@ -25,7 +25,8 @@ def bellman_bound(model: Model, cost_j: NDArray[np.float64]) -> float:
     rows = cost_j.shape[0]
     ahead = np.empty_like(cost_j)
     flat = np.ascontiguousarray(cost_j).reshape(rows, -1)
-    expect_over_demand(model.demand, flat, 0, flat.shape[1], ahead.reshape(rows, -1))
+    plane = model.cell_shape[1] * model.cell_shape[2]
+    expect_over_demand(model.demand, flat, cost_j.shape[2], plane, 0, flat.shape[1], ahead.reshape(rows, -1))
     improved = np.empty_like(cost_j)
     improve(model, ahead, 0, rows, improved, np.empty(cost_j.shape, dtype=np.int16))
     return float(np.max(np.abs(improved - cost_j))) / (1.0 - model.discount)
@@ -72,7 +73,8 @@ def _simulate(model, policy, power, share, cell, steps, random, totals):
             for axis in range(3):
                 if random.random() < fraction[axis]:
                     c += neighbour[axis]
-            p = _draw(model.demand[p], random.random())
+            group = c // (model.cell_shape[1] * model.cell_shape[2]) if model.demand.shape[0] > 1 else 0
+            p = _draw(model.demand[group, p], random.random())
             factor *= model.discount
         totals[run] = total
 

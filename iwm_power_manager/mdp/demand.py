@@ -4,6 +4,13 @@ A demand signal is sampled every decision step; each sample falls into the bin o
 (beyond the axis, into its end), and the steps from bin to bin are counted. Row i of the matrix is the distribution of
 the next demand, given demand i.
 
+Dependence on speed
+-------------------
+The paper's chain knows the demand only. But 3 kW at 2 m/s is a start that will be over in a second, and 3 kW at 25 m/s
+is cruising; how long a choice of the split will pay is just what the chain is to tell. With `demand_by_speed` there is a
+matrix for each point of the speed axis, counted from the steps that end near that speed, and mixed with the chain of
+all speeds where there are few. The solver's structure stays: the next speed does not depend on the next demand.
+
 Rows without data
 -----------------
 A demand no source ever had still needs a next one, or the problem is not defined. It moves one bin a step towards the
@@ -14,6 +21,7 @@ cost-to-go there would be that of driving at this power for ever.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,6 +32,7 @@ from numpy.typing import NDArray
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.jit import kernel
+from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
 from iwm_power_manager.vehicle import VehicleParams
 
@@ -43,12 +52,14 @@ class Source:
     sha256 : hash of its content
     weight : how much each of its steps counts
     sequences : demand in W at the decision step; no step leads from one sequence to the next
+    speeds : vehicle speed in m/s at the same instants; empty if it is not known
     """
 
     name: str
     sha256: str
     weight: float
     sequences: tuple[NDArray[np.float64], ...]
+    speeds: tuple[NDArray[np.float64], ...] = ()
 
     @property
     def steps(self) -> int:
@@ -64,14 +75,21 @@ class DemandChain:
     ----------
     power_w : float64[P], the axis
     probability : float64[P, P], row i to column j; rows sum to 1
+    by_speed : float64[V, P, P], the same for each point of the speed axis; V = 0 if it does not depend on the speed
     row_steps : float64[P], weighted number of steps counted in each row; 0 where it was never visited
     clipped : part of all samples that lay outside the axis
     """
 
     power_w: NDArray[np.float64]
     probability: NDArray[np.float64]
+    by_speed: NDArray[np.float64]
     row_steps: NDArray[np.float64]
     clipped: float
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """float64[G, P, P] as the solver takes it: G = V, or 1 if it does not depend on the speed."""
+        return self.by_speed if self.by_speed.shape[0] else self.probability[None]
 
     @property
     def unvisited_w(self) -> NDArray[np.float64]:
@@ -105,7 +123,10 @@ def cycle_power_w(cycle: Cycle, dt_s: float, vehicle: VehicleParams) -> NDArray[
 
 def cycle_source(cycle: Cycle, dt_s: float, vehicle: VehicleParams, weight: float = 1.0) -> Source:
     """A cycle as a source of demand."""
-    return Source(cycle.name, cycle.sha256, weight, (cycle_power_w(cycle, dt_s, vehicle),))
+    speed = cycle.resample(dt_s).speed_mps
+    return Source(
+        cycle.name, cycle.sha256, weight, (cycle_power_w(cycle, dt_s, vehicle),), (0.5 * (speed[1:] + speed[:-1]),)
+    )
 
 
 def signal_source(
@@ -114,6 +135,7 @@ def signal_source(
     power_w: NDArray[np.float64],
     dt_s: float,
     weight: float = 1.0,
+    speed_mps: NDArray[np.float64] | None = None,
 ) -> Source:
     """A recorded demand signal as a source: cut at gaps, each piece sampled at the decision step.
 
@@ -124,22 +146,25 @@ def signal_source(
     Parameters
     ----------
     time_s, power_w : float64[n], stamps and demand
+    speed_mps : float64[n], vehicle speed, if it is known
     """
-    time_s, power_w = np.asarray(time_s, dtype=np.float64), np.asarray(power_w, dtype=np.float64)
-    good = np.isfinite(time_s) & np.isfinite(power_w)
-    time_s, power_w = time_s[good], power_w[good]
-    if time_s.size:
-        latest = np.maximum.accumulate(time_s)
-        rising = np.concatenate([[True], time_s[1:] > latest[:-1]])
-        time_s, power_w = time_s[rising], power_w[rising]
-    cuts = np.flatnonzero(np.diff(time_s) > MAX_GAP_S) + 1
-    sequences = []
-    for times, values in zip(np.split(time_s, cuts), np.split(power_w, cuts), strict=True):
+    columns = [np.asarray(values, dtype=np.float64) for values in (time_s, power_w, speed_mps) if values is not None]
+    good = np.all(np.isfinite(columns), axis=0)
+    columns = [values[good] for values in columns]
+    if columns[0].size:
+        latest = np.maximum.accumulate(columns[0])
+        rising = np.concatenate([[True], columns[0][1:] > latest[:-1]])
+        columns = [values[rising] for values in columns]
+    cuts = np.flatnonzero(np.diff(columns[0]) > MAX_GAP_S) + 1
+    pieces: list[list[NDArray[np.float64]]] = [[] for _ in columns[1:]]
+    for times, *signals in zip(*(np.split(values, cuts) for values in columns), strict=True):
         if times.size >= 2 and times[-1] - times[0] >= dt_s:
             steps = int((times[-1] - times[0]) / dt_s + 1e-9)
-            sequences.append(np.interp(times[0] + np.arange(steps + 1) * dt_s, times, values))
-    digest = hashlib.sha256(time_s.tobytes() + power_w.tobytes()).hexdigest()
-    return Source(name, digest, weight, tuple(sequences))
+            at = times[0] + np.arange(steps + 1) * dt_s
+            for piece, signal in zip(pieces, signals, strict=True):
+                piece.append(np.interp(at, times, signal))
+    digest = hashlib.sha256(b"".join(values.tobytes() for values in columns)).hexdigest()
+    return Source(name, digest, weight, *map(tuple, pieces))
 
 
 def nearest_bin(axis: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -182,4 +207,35 @@ def demand_chain(axis: NDArray[np.float64], sources: Sequence[Source]) -> Demand
         candidates = visited[distance == distance.min()]
         target = candidates[np.argmin(np.abs(axis[candidates]))]
         probability[row, row + np.sign(target - row)] = 1.0
-    return DemandChain(axis, probability, row_steps, outside / max(samples, 1))
+    return DemandChain(axis, probability, np.zeros((0, n, n)), row_steps, outside / max(samples, 1))
+
+
+def chain_of(problem: Problem, sources: Sequence[Source]) -> DemandChain:
+    """The Markov chain a problem asks for: of the demand alone, or of the demand at each speed.
+
+    Raises
+    ------
+    ConfigError
+        There is not a single step to count, or a source lacks the speed.
+    """
+    chain = demand_chain(problem.power_w, sources)
+    if not problem.demand_by_speed:
+        return chain
+    n, points = problem.power_w.size, problem.speed_mps
+    # Each point's share of a step fades out linearly with the distance in speed, and reaches its neighbours at least.
+    gap = np.diff(points)
+    reach = np.maximum(
+        problem.speed_bandwidth_mps, 0.5 * (np.append(gap, gap[-1:]) + np.insert(gap, 0, gap[:1])) if gap.size else 0.0
+    )
+    counts = np.zeros((points.size, n, n))
+    for source in sources:
+        if len(source.speeds) != len(source.sequences):
+            raise ConfigError(source.name, "speed", "is not known, and the problem has demand_by_speed")
+        for sequence, speed in zip(source.sequences, source.speeds, strict=True):
+            bins = nearest_bin(problem.power_w, sequence)
+            for v, point in enumerate(points):
+                weight = source.weight * np.maximum(1.0 - np.abs(speed[1:] - point) / reach[v], 0.0)
+                counts[v] += np.bincount(bins[:-1] * n + bins[1:], weight, n * n).reshape(n, n)
+    mixed = counts + problem.prior_steps * chain.probability
+    by_speed = mixed / mixed.sum(axis=2, keepdims=True)
+    return dataclasses.replace(chain, by_speed=by_speed)

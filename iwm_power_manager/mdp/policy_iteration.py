@@ -64,7 +64,8 @@ class Model(NamedTuple):
     Attributes
     ----------
     discount : gamma
-    demand : float64[P, P], transition matrix of the power demand, rows sum to 1
+    demand : float64[G, P, P], transition matrix of the power demand, rows sum to 1: one for all speeds (G = 1), or one
+        for each point of the speed axis, by the speed the step ends at
     cell_shape : points over (speed, slip front, slip rear); a cell's index is in C order
     switching_j : float64[S, U], cost of share s -> u; S = 1 where the previous share is no state
     free_start : int64[P + 1], first free cell of each power demand
@@ -93,7 +94,7 @@ class Model(NamedTuple):
     @property
     def state_shape(self) -> tuple[int, int, int]:
         """Number of (power demands, previous shares, cells)."""
-        return self.demand.shape[0], self.switching_j.shape[0], int(np.prod(self.cell_shape))
+        return self.demand.shape[1], self.switching_j.shape[0], int(np.prod(self.cell_shape))
 
 
 class Iteration(NamedTuple):
@@ -162,17 +163,37 @@ def _interpolate(w, corner, step_v, step_f, step_r, a, b, c):
 
 
 @parallel_kernel
-def expect_over_demand(demand, cost, first_column, last_column, out):
-    """Compute out = demand @ cost in a range of columns; arrays [P, n]. Each sum runs in the order of the rows."""
+def expect_over_demand(demand, cost, period, plane, first_column, last_column, out):
+    """Compute out = demand @ cost in a range of columns; arrays [P, n]. Each sum runs in the order of the rows.
+
+    Where demand[G, P, P] has a matrix for each speed, column i belongs to speed (i % period) // plane.
+    """
+    groups, powers, _ = demand.shape
+    weight = np.empty(groups)
     for first in range(first_column, last_column, _BLOCK):
         last = min(first + _BLOCK, last_column)
-        for p in range(demand.shape[0]):
+        for p in range(powers):
             out[p, first:last] = 0.0
-            for q in range(demand.shape[1]):
-                weight = demand[p, q]
-                if weight != 0.0:
+            for q in range(powers):
+                total = 0.0
+                for g in range(groups):
+                    weight[g] = demand[g, p, q]
+                    total += weight[g]
+                if total == 0.0:
+                    continue
+                if groups == 1:
                     for i in range(first, last):
-                        out[p, i] += weight * cost[q, i]
+                        out[p, i] += total * cost[q, i]
+                    continue
+                # Counting along is several times faster than a division for each column.
+                g = first % period // plane
+                left = plane - first % plane
+                for i in range(first, last):
+                    out[p, i] += weight[g] * cost[q, i]
+                    left -= 1
+                    if left == 0:
+                        left = plane
+                        g = g + 1 if g + 1 < groups else 0
 
 
 @parallel_kernel
@@ -310,7 +331,12 @@ class _Operator:
     def _expect(self, cost: NDArray[np.float64]) -> None:
         rows = cost.shape[0]
         flat, ahead = cost.reshape(rows, -1), self.ahead.reshape(rows, -1)
-        over_ranges(flat.shape[1], lambda first, last: expect_over_demand(self.model.demand, flat, first, last, ahead))
+        cells = cost.shape[2]
+        plane = self.model.cell_shape[1] * self.model.cell_shape[2]
+        over_ranges(
+            flat.shape[1],
+            lambda first, last: expect_over_demand(self.model.demand, flat, cells, plane, first, last, ahead),
+        )
         self.sweeps += 1
 
     def improve(self, cost: NDArray[np.float64], out: NDArray[np.float64], policy: NDArray[np.int16]) -> None:
@@ -423,7 +449,7 @@ def solve(
     history: list[Iteration] = []
     share_of = np.append(share, 0.0)  # the last entry serves GATED = -1
     residual_target = tolerance_j * (1.0 - model.discount) / model.discount if model.discount > 0.0 else np.inf
-    rounding = (model.demand.shape[0] + 16) * np.finfo(np.float64).eps / (1.0 - model.discount)
+    rounding = (model.demand.shape[1] + 16) * np.finfo(np.float64).eps / (1.0 - model.discount)
     forcing = _FORCING
     smallest = np.inf
     while True:

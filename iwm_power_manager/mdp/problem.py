@@ -98,6 +98,9 @@ class Problem:
     alpha, power_error, error_norm, slip_model, skid_avoidance, critical_slip : see `ProblemParams`, codes by name
     switching_cost_j : cost of moving the whole power from one axle to the other, proportional to |change of share|
     switching_fixed_cost_j : cost of any change at all
+    demand_by_speed : whether the demand's Markov chain depends on the speed; the paper's does not
+    speed_bandwidth_mps : with it, steps at speeds up to this far away count for a point of the speed axis, fading out
+    prior_steps : with it, the chain of all speeds counts as this many steps in every row, where data are few
     tolerance_j : solve until the cost-to-go is certified to be this close to the optimal one, J
     max_iterations : give up after this many policies
     """
@@ -119,6 +122,9 @@ class Problem:
     critical_slip: float
     switching_cost_j: float
     switching_fixed_cost_j: float
+    demand_by_speed: bool
+    speed_bandwidth_mps: float
+    prior_steps: float
     tolerance_j: float
     max_iterations: int
 
@@ -183,6 +189,9 @@ _OPTIONAL = (
     "critical_slip",
     "switching_cost_j",
     "switching_fixed_cost_j",
+    "demand_by_speed",
+    "speed_bandwidth_mps",
+    "prior_steps",
     "tolerance_j",
     "max_iterations",
 )
@@ -226,6 +235,11 @@ def problem_from(content: Any, path: Path | str) -> Problem:
         critical_slip=check_number(path, "critical_slip", content.get("critical_slip", 0.2), 0.01, 1.0),
         switching_cost_j=switching["switching_cost_j"],
         switching_fixed_cost_j=switching["switching_fixed_cost_j"],
+        demand_by_speed=check_bool(path, "demand_by_speed", content.get("demand_by_speed", False)),
+        speed_bandwidth_mps=check_number(
+            path, "speed_bandwidth_mps", content.get("speed_bandwidth_mps", 0.5), 0.0, 50.0, above=True, unit="m/s"
+        ),
+        prior_steps=check_number(path, "prior_steps", content.get("prior_steps", 5.0), 0.0, 1e9, above=True),
         tolerance_j=check_number(path, "tolerance_j", content.get("tolerance_j", 0.01), 1e-6, 1e6, unit="J"),
         max_iterations=check_integer(path, "max_iterations", content.get("max_iterations", 100), 1, 10_000),
     )

@@ -339,7 +339,7 @@ def build_model(problem: Problem, vehicle: VehicleParams, friction: float, deman
     problem : grids and settings
     vehicle : the car
     friction : peak friction coefficient of the road
-    demand : float64[P, P], transition matrix of the power demand over `problem.power_w`
+    demand : float64[G, P, P], `DemandChain.matrix` over `problem.power_w`
     """
     params = problem.params(friction)
     axes = (problem.power_w, problem.speed_mps, problem.slip_front, problem.slip_rear)

@@ -31,7 +31,7 @@ from iwm_power_manager.mdp.demand import (
     DemandChain,
     Source,
     cycle_source,
-    demand_chain,
+    chain_of,
     signal_source,
 )
 from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
@@ -156,7 +156,7 @@ def _solve(options: argparse.Namespace) -> int:
     say = _silent if options.quiet else print
 
     sources = _sources(options, problem.dt_s, vehicle)
-    chain = demand_chain(problem.power_w, sources)
+    chain = chain_of(problem, sources)
     say(_problem_text(problem, vehicle))
     say(_demand_text(chain, sources, problem.dt_s))
     for warning in demand_warnings(chain, problem.dt_s):
@@ -202,7 +202,11 @@ def _sources(options: argparse.Namespace, dt_s: float, vehicle: Vehicle) -> list
             print(f"solve_policy: warning: {path}: {damage}", file=sys.stderr)
         if drive.bad_messages:
             print(f"solve_policy: warning: {path}: {drive.bad_messages} bad messages left out", file=sys.stderr)
-        sources.append(signal_source(Path(path).name, drive.time_s, drive.power_demand_w, dt_s, options.bag_weight))
+        sources.append(
+            signal_source(
+                Path(path).name, drive.time_s, drive.power_demand_w, dt_s, options.bag_weight, drive.speed_mps
+            )
+        )
     return sources
 
 
@@ -236,7 +240,7 @@ def solve_one(
     """Solve for one road, write the policy, and say what it took."""
     started = time.perf_counter()
     with _Progress(f"friction {friction:g}", problem.tolerance_j, quiet) as progress:
-        model = build_model(problem, vehicle.params, friction, chain.probability)
+        model = build_model(problem, vehicle.params, friction, chain.matrix)
         built = time.perf_counter()
         solution: Solution = solve(
             model,
@@ -294,7 +298,7 @@ def _check(options: argparse.Namespace) -> int:
         path = resolve(name)
         policy = load_policy(path)
         policy.check_vehicle(vehicle, str(path))
-        model = build_model(policy.problem, vehicle.params, policy.friction, policy.chain.probability)
+        model = build_model(policy.problem, vehicle.params, policy.friction, policy.chain.matrix)
         powers, speeds, fronts, rears, shares = policy.problem.shape
         cost = policy.cost_j.reshape(powers, speeds * fronts * rears, shares).transpose(0, 2, 1)
         bound = bellman_bound(model, np.ascontiguousarray(cost))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -14,6 +15,7 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.mdp.demand import (
     THIN_ROW_STEPS,
     Source,
+    chain_of,
     count_steps,
     cycle_power_w,
     cycle_source,
@@ -21,6 +23,7 @@ from iwm_power_manager.mdp.demand import (
     nearest_bin,
     signal_source,
 )
+from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 
@@ -171,3 +174,43 @@ def test_a_recording_of_a_cycle_gives_the_cycle_s_chain():
     from_bag = demand_chain(axis, [recorded])
     from_cycle = demand_chain(axis, [cycle_source(cycle, 0.1, CAR)])
     assert np.array_equal(from_bag.probability, from_cycle.probability)
+
+
+def _by_speed(**changes):
+    problem = load_problem(share_path("config/grids/coupled.yaml"))
+    axes = {"power_w": AXIS, "speed_mps": np.array([0.0, 10.0, 20.0])}
+    return dataclasses.replace(problem, **{**axes, **changes})
+
+
+def test_a_chain_by_speed_tells_slow_from_fast():
+    # At 0 m/s a demand of 1 kW is followed by 2 kW, at 20 m/s by 1 kW.
+    slow = Source("slow", "0", 1.0, (np.array([1000.0, 2000.0] * 50),), (np.zeros(100),))
+    fast = Source("fast", "1", 1.0, (np.full(100, 1000.0),), (np.full(100, 20.0),))
+    chain = chain_of(_by_speed(prior_steps=1e-9), [slow, fast])
+    one, two = np.searchsorted(AXIS, [1000.0, 2000.0])
+    assert chain.by_speed[0, one, two] == pytest.approx(1.0)
+    assert chain.by_speed[2, one, one] == pytest.approx(1.0)
+    # Between them, without data of its own, the chain of all speeds holds.
+    assert chain.by_speed[1] == pytest.approx(chain.probability)
+    assert chain.matrix is chain.by_speed
+
+
+def test_rows_by_speed_are_distributions_and_few_data_lean_on_the_chain_of_all_speeds():
+    source = cycle_source(load_cycle(share_path("config/cycles/nycc.csv")), 0.1, CAR)
+    for prior in (1e-6, 5.0, 1e12):
+        chain = chain_of(_by_speed(prior_steps=prior), [source])
+        assert chain.by_speed.sum(axis=2) == pytest.approx(np.ones((3, AXIS.size)), abs=1e-12)
+    assert chain.by_speed[0] == pytest.approx(chain.probability, abs=1e-6)
+
+
+def test_a_source_without_speed_is_refused_where_the_chain_depends_on_it():
+    source = signal_source("bag", np.arange(10.0) * 0.1, np.ones(10), 0.1)
+    with pytest.raises(ConfigError, match="bag: speed: is not known"):
+        chain_of(_by_speed(), [source])
+
+
+def test_the_paper_s_chain_does_not_depend_on_speed():
+    source = cycle_source(load_cycle(share_path("config/cycles/nycc.csv")), 0.1, CAR)
+    chain = chain_of(_by_speed(demand_by_speed=False), [source])
+    assert chain.by_speed.shape[0] == 0
+    assert chain.matrix.tolist() == [chain.probability.tolist()]

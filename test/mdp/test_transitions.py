@@ -207,7 +207,7 @@ def _tiny(**changes):
 
 def test_the_tables_hold_one_entry_for_every_state_and_control():
     problem = _tiny()
-    demand = np.full((4, 4), 0.25)
+    demand = np.full((1, 4, 4), 0.25)
     model = build_model(problem, CAR.params, 0.5, demand)
     params = problem.params(0.5)
     gated = gated_states(problem, 0.5)
@@ -245,7 +245,7 @@ def test_the_tables_hold_one_entry_for_every_state_and_control():
 
 def test_gated_states_hold_the_one_step_that_table_2_leaves():
     problem = _tiny()
-    model = build_model(problem, CAR.params, 0.5, np.eye(4))
+    model = build_model(problem, CAR.params, 0.5, np.eye(4)[None])
     assert model.gated_cell.size == np.count_nonzero(gated_states(problem, 0.5))
     assert model.gated_cell.size > 0
     p = 0
@@ -261,5 +261,5 @@ def test_where_no_control_is_feasible_those_that_deliver_most_are_left():
     problem = _tiny(
         power_w=np.array([19000.0]), speed_mps=np.array([2.0]), slip_front=np.zeros(1), slip_rear=np.zeros(1)
     )
-    model = build_model(problem, CAR.params, 0.9, np.eye(1))
+    model = build_model(problem, CAR.params, 0.9, np.eye(1)[None])
     assert np.array_equal(np.isfinite(model.free_cost), [False, True, False])

@@ -11,7 +11,7 @@ from iwm_power_manager.mdp.policy_iteration import Model, list_cells
 
 
 class Raw(NamedTuple):
-    """A problem before it is packed: cost[P, C, U], lower corner[P, C, U, 3], fraction[P, C, U, 3], gated[P, C]."""
+    """A problem before it is packed: demand[G, P, P], cost[P, C, U], lower corner[P, C, U, 3], fraction[P, C, U, 3], gated[P, C]."""
 
     discount: float
     demand: np.ndarray
@@ -30,8 +30,10 @@ class Raw(NamedTuple):
 def random_raw(rng, powers, cell_shape, controls, tracked, discount, gated=0.3, infeasible=0.2, scale=100.0) -> Raw:
     """A problem without any physics: it has only the structure the solver relies on."""
     cells = int(np.prod(cell_shape))
-    demand = rng.random((powers, powers)) * (rng.random((powers, powers)) < 0.6) + 1e-3 * np.eye(powers)
-    demand /= demand.sum(axis=1, keepdims=True)
+    groups = cell_shape[0] if rng.random() < 0.5 else 1
+    demand = rng.random((groups, powers, powers)) * (rng.random((groups, powers, powers)) < 0.6)
+    demand += 1e-3 * np.eye(powers)
+    demand /= demand.sum(axis=2, keepdims=True)
     cost = rng.normal(size=(powers, cells, controls)) * scale
     forbidden = rng.random(cost.shape) < infeasible
     forbidden[..., 0] = False
@@ -109,7 +111,8 @@ def dense(raw: Raw) -> tuple[np.ndarray, np.ndarray]:
                     place.append(min(raw.corner[p, c, u, axis] + offset, raw.cell_shape[axis] - 1))
                 next_cell = np.ravel_multi_index(place, raw.cell_shape)
                 for q in range(powers):
-                    probability[x, u, index(q, next_share, next_cell)] += weight * raw.demand[p, q]
+                    group = place[0] if raw.demand.shape[0] > 1 else 0
+                    probability[x, u, index(q, next_share, next_cell)] += weight * raw.demand[group, p, q]
     return cost, probability
 
 
