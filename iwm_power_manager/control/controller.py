@@ -137,9 +137,7 @@ class Controller:
         demand = shape_demand(monitor.demand_w, monitor.demand_speed_mps, speed, supervision)
         discharge, charge = battery_limits_w(monitor.soc, monitor.temperature_c, self._vehicle.battery)
         factor = supervision.motor_factor
-        return Measurement(
-            speed, wheels, demand, dt_s, self.friction, discharge * factor, charge * factor, monitor.soc
-        )
+        return Measurement(speed, wheels, demand, dt_s, self.friction, discharge * factor, charge * factor, monitor.soc)
 
     def _settings(self) -> Settings:
         if not self.wheels_lost:

@@ -26,13 +26,14 @@ def violated_bound(command: Command, vehicle: VehicleParams) -> str:
     """
     if command.gate not in (GATE_NONE, GATE_FRONT, GATE_REAR, GATE_BOTH):
         return f"gate {command.gate} does not exist"
+    brake = vehicle.friction_brake.max_torque_nm
     for i, (motor, friction) in enumerate(zip(command.motor_torque_nm, command.friction_torque_nm, strict=True)):
         if not math.isfinite(motor) or not math.isfinite(friction):
             return f"torque of wheel {i} is not finite: motor {motor}, friction {friction}"
         if abs(motor) > vehicle.motor.peak_torque_nm + _SLACK_NM:
             return f"motor torque of wheel {i} is {motor:g} N m, beyond {vehicle.motor.peak_torque_nm:g}"
-        if not -vehicle.friction_brake.max_torque_nm - _SLACK_NM <= friction <= 0.0:
-            return f"friction torque of wheel {i} is {friction:g} N m, outside {-vehicle.friction_brake.max_torque_nm:g}..0"
+        if not -brake - _SLACK_NM <= friction <= 0.0:
+            return f"friction torque of wheel {i} is {friction:g} N m, outside {-brake:g}..0"
         if command.gate in _GATES_OF_WHEEL[i] and (motor != 0.0 or friction != 0.0):
             return f"wheel {i} is gated and has {motor:g} + {friction:g} N m"
     return ""

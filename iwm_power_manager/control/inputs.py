@@ -217,7 +217,13 @@ def judge_wheels(
     """
     judged = [
         _judge_wheel(
-            received_radps[i], received_radps[_OTHER[i]], car_radps, dt_s, memory[i], limits, limits.moving_mps / radius_m
+            received_radps[i],
+            received_radps[_OTHER[i]],
+            car_radps,
+            dt_s,
+            memory[i],
+            limits,
+            limits.moving_mps / radius_m,
         )
         for i in range(4)
     ]

@@ -148,10 +148,7 @@ class InputMonitor:
     def __init__(self, wheel_names: tuple[str, ...], limits: InputLimits) -> None:
         self._wheel_names = wheel_names
         self._limits = limits
-        self.tallies = {
-            topic: Tally()
-            for topic in (SPEED, WHEELS, DEMAND, BATTERY, FRICTION)
-        }
+        self.tallies = {topic: Tally() for topic in (SPEED, WHEELS, DEMAND, BATTERY, FRICTION)}
         self.forget()
 
     def forget(self) -> None:

@@ -25,7 +25,10 @@ class Signal(NamedTuple):
 
 _MEASUREMENT = (
     Signal("speed_mps", "vehicle speed the law used"),
-    *(Signal(f"{wheel}_speed_radps", "wheel speed the law used; a lost wheel has its axle partner's") for wheel in _WHEELS),
+    *(
+        Signal(f"{wheel}_speed_radps", "wheel speed the law used; a lost wheel has its axle partner's")
+        for wheel in _WHEELS
+    ),
     Signal("power_demand_w", "power demand the law used: after the ramps of the degraded state"),
     Signal("dt_s", "time since the previous step"),
     Signal("friction", "peak friction coefficient the strategy assumed"),
@@ -39,8 +42,11 @@ _COMMAND = (
     Signal("front_share", "front axle's part of the power demand as applied, 0..1"),
     Signal("decided_share", "front share the strategy decided on, 0..1"),
     Signal("gate", "axles held at zero torque: 0 none, 1 front, 2 rear, 3 both"),
-    Signal("limits", "bits of the limits that bind: 1 motor, 2 regeneration, 4 battery discharge, 8 battery charge, "
-           "16 thermal, 32 slew, 64 slip limiter, 128 friction brake"),
+    Signal(
+        "limits",
+        "bits of the limits that bind: 1 motor, 2 regeneration, 4 battery discharge, 8 battery charge, "
+        "16 thermal, 32 slew, 64 slip limiter, 128 friction brake",
+    ),
     Signal("front_power_w", "power of the front axle's command"),
     Signal("rear_power_w", "power of the rear axle's command"),
     Signal("front_slip", "filtered slip of the front axle"),

@@ -24,7 +24,13 @@ class Policies:
     """
 
     def __init__(
-        self, bank: list[Policy], files: dict[Path, int], strategy: str, missing: str, fallback_reason: str, rule: list[float]
+        self,
+        bank: list[Policy],
+        files: dict[Path, int],
+        strategy: str,
+        missing: str,
+        fallback_reason: str,
+        rule: list[float],
     ) -> None:
         self.strategy = strategy
         self.fallback_reason = fallback_reason
@@ -48,7 +54,9 @@ class Policies:
 
     def problem_with(self, strategy: str) -> str:
         """Why a strategy cannot run; "" if it can."""
-        return f"strategy: {strategy} needs a policy; {self._missing}" if _needs_policy(strategy) and self._missing else ""
+        return (
+            f"strategy: {strategy} needs a policy; {self._missing}" if _needs_policy(strategy) and self._missing else ""
+        )
 
     def status(self) -> diagnostics.Status:
         """Identity of the policy in use, and whether its file is still the one that was loaded."""

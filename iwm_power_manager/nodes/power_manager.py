@@ -34,6 +34,7 @@ from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport
 from iwm_power_manager.ros import diagnostics, messages, qos, realtime
+from iwm_power_manager.ros.arguments import check_parameter_files
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
@@ -103,7 +104,7 @@ class PowerManager(LifecycleNode):
         self._last_step_ns: int | None = None
         self._last_step_steady_s = 0.0
         self._answer: tuple[JointState, JointState, JointState] | None = None
-        # rclpy lets a transition that the present state does not have end in an exception; its client would wait forever.
+        # rclpy ends a transition that the present state does not have in an exception; its client would wait forever.
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._change_state_if_possible
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -240,7 +241,7 @@ class PowerManager(LifecycleNode):
     def _create_entities(self) -> None:
         profile = qos.profile(lockstep=self._lockstep)
         overrides = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
-        # Who offers or asks for what cannot be met is told in the diagnostics; handlers would be waited for at each step.
+        # What cannot be met is told in the diagnostics; an event handler would be waited for at each step.
         silent = {"event_callbacks": PublisherEventCallbacks(use_default_callbacks=False)}
         self._publishers_made = {
             topic: self.create_lifecycle_publisher(JointState, topic, profile, **overrides, **silent)
@@ -510,15 +511,12 @@ def main(args: list[str] | None = None) -> int:
     signal.signal(signal.SIGINT, on_signal)
     signal.signal(signal.SIGTERM, on_signal)
     try:
+        check_parameter_files(sys.argv if args is None else args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:
-        print(f"power_manager: {str(error).splitlines()[0]}", file=sys.stderr)
-        return 1
-    try:
         node = PowerManager()
-    except IwmError as error:
-        print(f"power_manager: {error}", file=sys.stderr)
-        rclpy.shutdown()
+    except (IwmError, RuntimeError) as error:
+        print(f"power_manager: {str(error).splitlines()[0]}", file=sys.stderr)
+        rclpy.try_shutdown()
         return 1
     started = not node.get_parameter("autostart").value or node.start()
     executor = SingleThreadedExecutor()

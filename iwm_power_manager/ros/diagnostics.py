@@ -100,7 +100,9 @@ class LoopStatistics:
             values["period, min (ms)"] = f"{self._period_min_s * 1e3:.3f}"
             values["period, max (ms)"] = f"{self._period_max_s * 1e3:.3f}"
             if rate_hz is not None:
-                problems += _beyond(abs(mean_hz - rate_hz), limits, "periodicity", "hz", f"deviation from {rate_hz:g} Hz")
+                problems += _beyond(
+                    abs(mean_hz - rate_hz), limits, "periodicity", "hz", f"deviation from {rate_hz:g} Hz"
+                )
         elif rate_hz is not None:
             problems.append((ERROR, "no step since the last report"))
         steps = self.steps
@@ -156,10 +158,12 @@ class InputReport:
             for reason, count in sorted(tally.dropped.items()):
                 values[f"{topic}: dropped, {_words(reason)}"] = str(count)
             if topic in missing:
-                reason = f" ({_words(tally.violation)})" if tally.violation is not Violation.NONE else ""
-                problems.append((ERROR, f"{topic} is missing{reason}"))
+                why = f" ({_words(tally.violation)})" if tally.violation is not Violation.NONE else ""
+                problems.append((ERROR, f"{topic} is missing{why}"))
             elif dropped > self._dropped.get(topic, 0):
-                problems.append((WARN, f"{topic}: {_words(tally.violation)}" if tally.violation else f"{topic}: dropped"))
+                problems.append(
+                    (WARN, f"{topic}: {_words(tally.violation)}" if tally.violation else f"{topic}: dropped")
+                )
             self._received[topic], self._dropped[topic] = tally.received, dropped
         for name, verdict in zip(wheel_names, verdicts, strict=True):
             values[f"wheel {name}"] = _words(verdict)

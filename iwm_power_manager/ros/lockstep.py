@@ -52,21 +52,29 @@ class LockstepQueue:
         A set whose stamp is the one handed out last is a repetition; it comes with `demand=None`, because the caller
         only has to repeat its answer.
         """
-        if not self._align():
-            return None
-        heads = [queue[0] for queue in self._stamped]
-        stamp_ns = heads[SPEED].stamp_ns
-        demand = None
-        if stamp_ns != self._answered_ns:
-            while self._demands and self._demands[0][0] < heads[SPEED].sent_ns:
+        while self._align():
+            speed, wheels, battery = (queue[0] for queue in self._stamped)
+            if speed.stamp_ns == self._answered_ns:
+                return self._hand_out(speed, wheels, battery, None)
+            while self._demands and self._demands[0][0] < speed.sent_ns:
                 self._demands.popleft()
             if not self._demands:
                 return None
-            demand = self._demands.popleft()[1]
+            if len(self._stamped[SPEED]) > 1 and self._demands[0][0] > self._stamped[SPEED][1].sent_ns:
+                # Sent after the next set had begun: the demand of the set at hand was lost.
+                self._drop_heads()
+                continue
+            return self._hand_out(speed, wheels, battery, self._demands.popleft()[1])
+        return None
+
+    def _hand_out(self, speed: _Stamped, wheels: _Stamped, battery: _Stamped, demand: Any) -> LockstepSet:
+        self._drop_heads()
+        self._answered_ns = speed.stamp_ns
+        return LockstepSet(speed.stamp_ns, speed.value, wheels.value, battery.value, demand)
+
+    def _drop_heads(self) -> None:
         for queue in self._stamped:
             queue.popleft()
-        self._answered_ns = stamp_ns
-        return LockstepSet(stamp_ns, heads[SPEED].value, heads[WHEELS].value, heads[BATTERY].value, demand)
 
     def _align(self) -> bool:
         """Drop what belongs to incomplete sets until the heads agree; False when a queue runs empty.

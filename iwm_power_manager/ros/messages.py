@@ -53,7 +53,6 @@ TOPIC_TYPES: dict[str, type] = {
 _NANOSECONDS = 1_000_000_000
 
 
-
 def stamp_to_ns(stamp: Time) -> int:
     """Nanoseconds of a `builtin_interfaces/Time`."""
     return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)

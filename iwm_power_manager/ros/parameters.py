@@ -8,7 +8,9 @@ also what `docs/interface.md` is tested against.
 from __future__ import annotations
 
 import enum
+import json
 import math
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +26,9 @@ from rclpy.parameter import Parameter
 from iwm_power_manager.errors import IwmError
 
 Value = bool | int | float | str | list[str] | list[float]
+
+
+_WIDTH = 118
 
 
 class Change(enum.Enum):
@@ -163,6 +168,51 @@ def check_change(
         new[spec.name] = _plain(parameter.value)
     problem = together(new)
     return SetParametersResult(successful=not problem, reason=problem)
+
+
+def yaml_text(node_name: str, specs: Iterable[Spec], introduction: str) -> str:
+    """A parameter file with every parameter at its default, each below its description.
+
+    Parameters
+    ----------
+    node_name : the node, whatever its namespace
+    specs : its parameters; those with a dot in their names have to stand together
+    introduction : first lines, without the comment signs
+    """
+    lines = [f"# {line}" for line in textwrap.wrap(introduction, _WIDTH)]
+    lines += [f"/**/{node_name}:", "  ros__parameters:"]
+    group = ""
+    for spec in specs:
+        parent, _, name = spec.name.rpartition(".")
+        if parent and parent != group:
+            lines.append(f"    {parent}:")
+        group = parent
+        indent = "      " if parent else "    "
+        lines += [f"{indent}# {line}" for line in textwrap.wrap(spec.description, _WIDTH - len(indent))]
+        lines.append(f"{indent}{name}: {_yaml_value(spec.default)}")
+    return "\n".join(lines) + "\n"
+
+
+def markdown_table(specs: Iterable[Spec]) -> str:
+    """All parameters as a table for the documentation."""
+    lines = ["| parameter | default | allowed | changes | meaning |", "|---|---|---|---|---|"]
+    for spec in specs:
+        allowed = spec.allowed().replace("|", "\\|")
+        default = _yaml_value(spec.default)
+        lines.append(f"| `{spec.name}` | `{default}` | {allowed} | {spec.change.value} | {spec.description} |")
+    return "\n".join(lines) + "\n"
+
+
+def _yaml_value(value: Value) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{', '.join(_yaml_value(item) for item in value)}]"
+    if isinstance(value, float):
+        # YAML takes 1e6 for a text: a number needs its point.
+        mantissa, _, exponent = repr(value).partition("e")
+        return (mantissa if "." in mantissa else f"{mantissa}.0") + (f"e{exponent}" if exponent else "")
+    return json.dumps(value) if value in ("", "none") else str(value)
 
 
 def _plain(value: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -134,7 +135,7 @@ class TestMissingInputs:
         assert after[first]["stale"] == bit
         assert after[first]["mode"] == MODE_DEGRADED
         torques = [max(motor(values)) for values in after[first:]]
-        assert all(b <= a for a, b in zip(torques, torques[1:], strict=False))
+        assert all(b <= a for a, b in itertools.pairwise(torques))
         assert torques[fade_steps] == 0.0
         assert all(max(motor(values)) == 0.0 == min(motor(values)) for values in after[first + fade_steps :])
 
@@ -146,7 +147,7 @@ class TestMissingInputs:
         assert [values["mode"] for values in back].index(MODE_RECOVERING) == pytest.approx(10, abs=1)
         assert back[-1]["mode"] == MODE_NORMAL
         torques = [max(motor(values)) for values in back]
-        assert max(b - a for a, b in zip(torques, torques[1:], strict=False)) <= 16.0 + 1e-9
+        assert max(b - a for a, b in itertools.pairwise(torques)) <= 16.0 + 1e-9
 
     def test_a_live_brake_demand_moves_from_the_motors_to_the_friction_brakes(self, drive) -> None:
         drive.run(60, demand=-4000.0)

@@ -49,7 +49,9 @@ class TestEveryWheel:
     def test_a_friction_brake_only_brakes_and_no_more_than_it_can(self, vehicle, wheel) -> None:
         assert violated_bound(command(friction=one(wheel, -BRAKE)), vehicle) == ""
         assert violated_bound(command(friction=one(wheel, -BRAKE - 5e-7)), vehicle) == ""
-        assert f"friction torque of wheel {wheel}" in violated_bound(command(friction=one(wheel, -BRAKE - 2e-6)), vehicle)
+        assert f"friction torque of wheel {wheel}" in violated_bound(
+            command(friction=one(wheel, -BRAKE - 2e-6)), vehicle
+        )
         assert f"friction torque of wheel {wheel}" in violated_bound(command(friction=one(wheel, 1e-12)), vehicle)
 
     @pytest.mark.parametrize("gate", [GATE_FRONT, GATE_REAR, GATE_BOTH])

@@ -156,8 +156,15 @@ class TestWheels:
         assert reading.verdicts == (GOOD,) * 4
 
     @pytest.mark.parametrize("lost", range(4))
-    @pytest.mark.parametrize(("value", "verdict"), [(NAN, WheelVerdict.ABSENT), (math.inf, WheelVerdict.ABSENT),
-                                                    (201.0, WheelVerdict.OUT_OF_RANGE), (-201.0, WheelVerdict.OUT_OF_RANGE)])
+    @pytest.mark.parametrize(
+        ("value", "verdict"),
+        [
+            (NAN, WheelVerdict.ABSENT),
+            (math.inf, WheelVerdict.ABSENT),
+            (201.0, WheelVerdict.OUT_OF_RANGE),
+            (-201.0, WheelVerdict.OUT_OF_RANGE),
+        ],
+    )
     def test_a_lost_wheel_has_the_speed_of_the_other_wheel_of_its_axle(self, lost, value, verdict) -> None:
         received = [10.0, 11.0, 12.0, 13.0]
         partner = {0: 11.0, 1: 10.0, 2: 13.0, 3: 12.0}[lost]
@@ -311,7 +318,7 @@ class TestMemory:
         assert follow([((NAN, 30.0, 30.0, 30.0), 30.0)]).memory[0].distrust_s == WHEELS.distrust_s
 
     def test_a_new_wheel_remembers_nothing(self) -> None:
-        assert NEW_WHEELS == (WheelMemory(),) * 4
+        assert (WheelMemory(),) * 4 == NEW_WHEELS
         assert math.isnan(NEW_WHEELS[0].speed_radps)
         assert math.isnan(NEW_WHEELS[0].received_radps)
         assert NEW_WHEELS[0][1:3] == (0.0, 0.0)
@@ -325,7 +332,9 @@ class TestMemory:
 any_number = st.floats(allow_nan=True, allow_infinity=True)
 
 
-@given(st.lists(st.tuples(st.tuples(any_number, any_number, any_number, any_number), st.floats(0.0, 100.0)), min_size=1))
+@given(
+    st.lists(st.tuples(st.tuples(any_number, any_number, any_number, any_number), st.floats(0.0, 100.0)), min_size=1)
+)
 def test_whatever_comes_in_the_speeds_that_come_out_are_believable_or_declared_lost(steps) -> None:
     memory = NEW_WHEELS
     for received, car in steps:

@@ -53,7 +53,12 @@ def battery(stamp_ns: int, soc=0.5, temperature=25.0) -> BatteryReading:
 
 class TestSelectByName:
     def test_values_come_in_the_order_asked_for(self) -> None:
-        assert select_by_name(wheels(0, (3.0, 1.0, 4.0, 2.0), ("c", "a", "d", "b")), ("a", "b", "c", "d")) == (1, 2, 3, 4)
+        assert select_by_name(wheels(0, (3.0, 1.0, 4.0, 2.0), ("c", "a", "d", "b")), ("a", "b", "c", "d")) == (
+            1,
+            2,
+            3,
+            4,
+        )
         assert select_by_name(wheels(0, (1.0, 2.0), ("a", "b")), ("a", "b")) == (1.0, 2.0)
 
     def test_a_name_that_is_absent_or_doubled_has_no_value(self) -> None:

@@ -174,7 +174,11 @@ class TestShapeDemand:
         assert shape_demand(-8000.0, 0.0, 10.0, state) == -8000.0
 
     @given(
-        st.floats(-6e5, 1.5e5), st.floats(0.0, 60.0), st.floats(0.0, 60.0), st.integers(0, 15), st.floats(0.0, 1.0),
+        st.floats(-6e5, 1.5e5),
+        st.floats(0.0, 60.0),
+        st.floats(0.0, 60.0),
+        st.integers(0, 15),
+        st.floats(0.0, 1.0),
         st.floats(0.0, 1.0),
     )
     def test_the_shaped_demand_lies_between_zero_and_the_demand(self, demand, then, now, stale, motor, brake) -> None:

@@ -125,9 +125,7 @@ class Bench:
         self.node.create_subscription(JointState, messages.WHEEL_TORQUE_COMMAND, self.torques.append, keep_all)
         self.node.create_subscription(JointState, messages.FRICTION_BRAKE_COMMAND, self.frictions.append, keep_all)
         self.node.create_subscription(JointState, messages.POWER_MANAGER_STATE, self._on_state, keep_all)
-        self.node.create_subscription(
-            DiagnosticArray, f"{namespace}/diagnostics", self.diagnostics.append, keep_all
-        )
+        self.node.create_subscription(DiagnosticArray, f"{namespace}/diagnostics", self.diagnostics.append, keep_all)
         self.clients: dict[str, Any] = {}
 
     def _on_state(self, message: JointState) -> None:
@@ -156,8 +154,10 @@ class Bench:
         inputs = [publisher for topic, publisher in self.publishers.items() if topic != messages.CLOCK]
         outputs = (messages.WHEEL_TORQUE_COMMAND, messages.FRICTION_BRAKE_COMMAND, messages.POWER_MANAGER_STATE)
         self.spin_until(
-            lambda: all(p.get_subscription_count() for p in inputs)
-            and all(self.node.count_publishers(topic) for topic in outputs),
+            lambda: (
+                all(p.get_subscription_count() for p in inputs)
+                and all(self.node.count_publishers(topic) for topic in outputs)
+            ),
             "the power manager's topics",
         )
 
@@ -237,7 +237,13 @@ class Bench:
         return stamp
 
     def drive(
-        self, condition: Callable[[], Any], what: str, *, period_s: float = 0.01, patience_s: float = PATIENCE_S, **inputs: Any
+        self,
+        condition: Callable[[], Any],
+        what: str,
+        *,
+        period_s: float = 0.01,
+        patience_s: float = PATIENCE_S,
+        **inputs: Any,
     ) -> Any:
         """Publish inputs at a steady rate until `condition` is true; returns what it returned."""
         end = time.monotonic() + patience_s

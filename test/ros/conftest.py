@@ -28,9 +28,7 @@ class Pair:
         Pair._count += 1
         domain = int(os.environ["ROS_DOMAIN_ID"])
         namespace = f"/test_{os.getpid()}_{Pair._count}"
-        self.bench = Bench(
-            domain, lockstep=bool(parameters.get("lockstep")), namespace=namespace, sim_time=sim_time
-        )
+        self.bench = Bench(domain, lockstep=bool(parameters.get("lockstep")), namespace=namespace, sim_time=sim_time)
         remaps = {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics", "/clock": f"{namespace}/clock"}
         self.arguments = arguments({**EQUAL, **parameters, "use_sim_time": sim_time}, remaps)
         self._folder, self._domain = folder, domain
@@ -48,8 +46,22 @@ class Pair:
         self.running.process.wait()
 
 
+@pytest.fixture(scope="session")
+def compiled_law() -> None:
+    """Compile the law once, before processes are started that have to answer in time."""
+    from iwm_power_manager.control import law
+    from iwm_power_manager.control.types import Measurement, default_settings, initial_state
+    from iwm_power_manager.policy import empty_table
+    from iwm_power_manager.share import resolve
+    from iwm_power_manager.vehicle import load_vehicle
+
+    vehicle = load_vehicle(resolve("config/vehicles/jalalmaab_2015.yaml")).params
+    measurement = Measurement(1.0, (3.0, 3.0, 3.0, 3.0), 1.0, 0.01, 0.9, 1.0, 1.0, 0.5)
+    law.step(measurement, initial_state(), default_settings(), vehicle, empty_table())
+
+
 @pytest.fixture(scope="module")
-def start_pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Pair]]:
+def start_pair(tmp_path_factory: pytest.TempPathFactory, compiled_law: None) -> Iterator[Callable[..., Pair]]:
     """Start a power manager with parameters; all end with the module."""
     pairs: list[Pair] = []
 

@@ -68,6 +68,30 @@ def test_an_incomplete_set_is_skipped_once_the_next_is_complete() -> None:
         assert queue.pop() is None
 
 
+def test_a_set_whose_demand_was_lost_does_not_take_that_of_the_next() -> None:
+    queue = LockstepQueue()
+    push_set(queue, 10, 100, without=("demand",))
+    push_set(queue, 20, 200)
+    found = queue.pop()
+    assert found is not None
+    assert (found.stamp_ns, found.demand) == (20, 20.0)
+
+
+def test_sets_sent_ahead_wait_for_their_own_demands() -> None:
+    queue = LockstepQueue()
+    push_set(queue, 10, 100, without=("demand",))
+    push_set(queue, 20, 200, without=("demand",))
+    queue.push_demand(150, 10.0)
+    found = queue.pop()
+    assert found is not None
+    assert (found.stamp_ns, found.demand) == (10, 10.0)
+    assert queue.pop() is None
+    queue.push_demand(250, 20.0)
+    found = queue.pop()
+    assert found is not None
+    assert (found.stamp_ns, found.demand) == (20, 20.0)
+
+
 def test_a_stamp_may_go_back_when_a_new_run_begins() -> None:
     queue = LockstepQueue()
     push_set(queue, 50, 100)
@@ -104,7 +128,9 @@ def test_clearing_forgets_messages_and_the_last_answer() -> None:
 def test_sets_come_out_complete_and_in_order_however_topics_interleave(count, random) -> None:
     queue = LockstepQueue()
     lanes = [[(SPEED, i), (WHEELS, i), (BATTERY, i), ("demand", i)] for i in range(count)]
-    topics = [[message for lane in lanes for message in lane if message[0] == t] for t in (SPEED, WHEELS, BATTERY, "demand")]
+    topics = [
+        [message for lane in lanes for message in lane if message[0] == t] for t in (SPEED, WHEELS, BATTERY, "demand")
+    ]
     out = []
     while any(topics):
         topic, i = random.choice([t for t in topics if t]).pop(0)

@@ -1,0 +1,256 @@
+"""The running node and its inputs over DDS: bad ones are dropped and counted, missing ones degrade, all recovers."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from std_msgs.msg import Float64
+
+from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.ros import messages, qos
+
+NAN = math.nan
+
+
+@pytest.fixture(scope="module")
+def bench(start_pair):
+    bench = start_pair({"rule": [0.0, 0.9, 0.0, 0.9]}).bench
+    bench.connect()
+    return bench
+
+
+@pytest.fixture(autouse=True)
+def normal(bench):
+    """Every test starts from a node in normal operation."""
+    bench.drive(lambda: bench.mode() == 1 and bench.last("stale") == 0, "normal operation")
+    bench.diagnostics.clear()
+
+
+def counter(bench, key: str) -> int:
+    bench.diagnostics.clear()
+    bench.drive(lambda: bench.status("inputs"), "a report")
+    return int({entry.key: entry.value for entry in bench.status("inputs").values}.get(key, "0"))
+
+
+def send_alone(bench, **inputs) -> None:
+    """Send a set and wait for a step: of a queue of one, the next set would overwrite it."""
+    bench.drive(lambda: bench.last("stale") == 0, "a step")
+    steps = len(bench.states)
+    bench.spin_until(lambda: len(bench.states) > steps, "a step")
+    bench.send(**inputs)
+    steps = len(bench.states)
+    bench.spin_until(lambda: len(bench.states) > steps + 2, "two steps")
+
+
+@pytest.mark.parametrize(
+    ("bad", "key"),
+    [
+        ({"speed": NAN, "wheels": (30.3,) * 4}, "vehicle_speed: dropped, not finite"),
+        ({"speed": 500.0, "wheels": (30.3,) * 4}, "vehicle_speed: dropped, out of range"),
+        ({"speed": 30.0, "wheels": (30.3,) * 4}, "vehicle_speed: dropped, too fast"),
+        ({"demand": math.inf}, "power_demand: dropped, not finite"),
+        ({"demand": 1e7}, "power_demand: dropped, out of range"),
+        ({"soc": NAN}, "battery_state: dropped, not finite"),
+        ({"temperature": 1000.0}, "battery_state: dropped, out of range"),
+        ({"wheels": (30.3,) * 3}, "wheel_states: dropped, length"),
+        (
+            {"wheels": (30.3,) * 4, "names": ("front_left", "front_left", "rear_left", "rear_right")},
+            "wheel_states: dropped, name twice",
+        ),
+        ({"wheels": (NAN, NAN, 30.3, 30.3)}, "wheel_states: dropped, axle lost"),
+        ({"wheels": (), "names": ()}, "wheel_states: dropped, axle lost"),
+    ],
+)
+def test_one_bad_message_is_dropped_and_counted_and_changes_nothing(bench, bad, key) -> None:
+    before = counter(bench, key)
+    start = len(bench.states)
+    send_alone(bench, **bad)
+    assert counter(bench, key) > before
+    assert all(math.isfinite(value) for state in bench.states[start:] for value in state.values())
+    # The speed itself, or, where it is missing for too long, what the wheels tell.
+    assert all(state["speed_mps"] == pytest.approx(10.0, rel=0.01) for state in bench.states[start:])
+
+
+def test_a_stamp_from_the_future_or_from_long_ago_is_dropped(bench) -> None:
+    for offset_ns, key in ((10**9, "stamp in future"), (-(10**9), "stamp too old")):
+        before = counter(bench, f"vehicle_speed: dropped, {key}")
+        send_alone(bench, stamp_ns=bench.stamp() + offset_ns)
+        assert counter(bench, f"vehicle_speed: dropped, {key}") > before
+
+
+@pytest.mark.parametrize(
+    ("without", "bit"), [("vehicle_speed", 1), ("wheel_states", 2), ("power_demand", 4), ("battery_state", 8)]
+)
+def test_a_missing_input_degrades_to_zero_torque_and_recovers(bench, without, bit) -> None:
+    start = len(bench.states)
+    bench.drive(lambda: bench.last("motor_factor") == 0.0, "zero torque", without=(without,))
+    degraded = [state for state in bench.states[start:] if state["mode"] == 2]
+    assert degraded
+    assert all(int(state["stale"]) & bit for state in degraded)
+    torques = [state["front_left_motor_torque_nm"] for state in degraded]
+    assert all(b <= a + 1e-9 for a, b in itertools.pairwise(torques))
+    bench.spin_until(lambda: bench.torques[-1].effort[0] == 0.0, "the last torque")
+    bench.drive(
+        lambda: bench.status("control") and without in bench.status("control").message, "the report", without=(without,)
+    )
+    assert bench.status("control").level == DiagnosticStatus.ERROR
+    bench.drive(lambda: bench.mode() == 1, "recovery")
+
+
+def test_an_input_that_repeats_its_stamp_counts_as_missing(bench) -> None:
+    frozen = bench.stamp()
+    bench.drive(lambda: int(bench.last("stale")) & 3 == 3, "degraded", stamp_ns=frozen)
+    assert counter(bench, "vehicle_speed: dropped, stamp not newer") > 0
+
+
+def test_wheels_are_matched_by_name(bench) -> None:
+    names = ("rear_right", "front_left", "rear_left", "front_right")
+    bench.drive(
+        lambda: bench.last("front_left_speed_radps") == 30.1 and bench.last("rear_right_speed_radps") == 30.4,
+        "matched wheels",
+        wheels=(30.4, 30.1, 30.3, 30.2),
+        names=names,
+    )
+    assert bench.last("front_right_speed_radps") == 30.2
+    assert bench.last("rear_left_speed_radps") == 30.3
+
+
+def test_with_one_wheel_missing_it_works_on_and_warns(bench) -> None:
+    def drive(condition, what):
+        bench.drive(condition, what, wheels=(30.3,) * 3, names=messages.WHEEL_NAMES[:3])
+
+    drive(lambda: bench.last("wheels_lost") == 8, "a lost wheel")
+    drive(lambda: bench.status("inputs") and "rear_right" in bench.status("inputs").message, "the warning")
+    assert bench.status("inputs").level == DiagnosticStatus.WARN
+    assert bench.mode() == 1
+    assert bench.last("rear_right_motor_torque_nm") > 0.0
+    bench.drive(lambda: bench.last("wheels_lost") == 0, "the wheel again")
+
+
+def test_the_command_is_named_stamped_and_split_left_and_right_alike(bench) -> None:
+    bench.drive(lambda: bench.last("front_left_motor_torque_nm") > 40.0, "torque")
+    torque, friction = bench.torques[-1], bench.frictions[-1]
+    assert tuple(torque.name) == tuple(friction.name) == messages.WHEEL_NAMES
+    assert torque.effort[0] == torque.effort[1]
+    assert torque.effort[2] == torque.effort[3]
+    assert all(effort <= 0.0 for effort in friction.effort)
+    stamps = [messages.stamp_to_ns(m.header.stamp) for m in bench.torques]
+    assert stamps == sorted(set(stamps))
+    assert len(torque.position) == len(torque.velocity) == 0
+
+
+def test_the_state_carries_every_documented_signal(bench) -> None:
+    assert list(bench.states[-1]) == SIGNAL_NAMES
+
+
+class TestDiagnostics:
+    def test_a_healthy_node_is_ok_everywhere(self, bench) -> None:
+        bench.drive(lambda: len(bench.diagnostics) >= 2, "reports")
+        names = {status.name for status in bench.diagnostics[-1].status}
+        assert names == {
+            f"power_manager: {name}" for name in ("control", "inputs", "control loop", "policy", "command topics")
+        }
+        for name in ("control", "inputs", "policy", "command topics"):
+            bench.drive(lambda name=name: bench.status(name).level == DiagnosticStatus.OK, f"{name} to be ok")
+
+    def test_it_tells_ages_rates_and_times(self, bench) -> None:
+        bench.drive(lambda: len(bench.diagnostics) >= 3, "reports")
+        inputs = {entry.key: entry.value for entry in bench.status("inputs").values}
+        assert float(inputs["vehicle_speed: age (s)"]) < 1.0
+        assert 10.0 < float(inputs["wheel_states: rate (Hz)"]) < 200.0
+        loop = {entry.key: entry.value for entry in bench.status("control loop").values}
+        assert float(loop["rate, mean (Hz)"]) > 10.0
+        assert float(loop["execution time, mean (us)"]) > 0.0
+
+    def test_a_second_publisher_on_a_command_topic_is_an_error(self, bench) -> None:
+        intruder = bench.node.create_publisher(
+            messages.TOPIC_TYPES[messages.WHEEL_TORQUE_COMMAND],
+            messages.WHEEL_TORQUE_COMMAND,
+            qos.profile(lockstep=False),
+        )
+        bench.drive(
+            lambda: bench.status("command topics") and bench.status("command topics").level == DiagnosticStatus.ERROR,
+            "the error",
+        )
+        assert "wheel_torque_command has 2 publishers" in bench.status("command topics").message
+        bench.node.destroy_publisher(intruder)
+        bench.drive(lambda: bench.status("command topics").level == DiagnosticStatus.OK, "quiet again")
+
+    def test_a_publisher_with_weaker_quality_of_service_is_named(self, start_pair) -> None:
+        pair = start_pair({"autostart": True})
+        bench = pair.bench
+        strong = bench.publishers.pop(messages.POWER_DEMAND)
+        bench.node.destroy_publisher(strong)
+        weak = bench.node.create_publisher(
+            Float64, messages.POWER_DEMAND, qos.profile(lockstep=False, reliability="best_effort")
+        )
+        bench.spin_until(
+            lambda: bench.status("input topics") and "power_demand" in bench.status("input topics").message, "the error"
+        )
+        bench.node.destroy_publisher(weak)
+
+
+class TestParameters:
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("friction", 0.0),
+            ("friction", NAN),
+            ("friction", "slippery"),
+            ("strategy", "clever"),
+            ("gate_mode", ""),
+            ("critical_slip", 0.1),  # below slip_target
+            ("slip_target", 0.3),
+            ("rate_hz", 50.0),  # not while configured
+            ("wheel_names", ["a", "b", "c", "d"]),
+            ("lockstep", True),
+            ("policy_file", "other"),
+            ("rule", [1.0, 2.0]),
+            ("strategy", "sdp"),  # there is no policy
+        ],
+    )
+    def test_a_bad_value_is_refused_with_a_reason_and_changes_nothing(self, bench, name, value) -> None:
+        before = bench.get_parameter(name)
+        assert bench.set_parameter(name, value) != ""
+        assert bench.get_parameter(name) == before
+
+    def test_a_change_while_driving_takes_effect_without_a_jump(self, bench) -> None:
+        bench.drive(lambda: bench.last("front_left_motor_torque_nm") > 40.0, "torque")
+        start = len(bench.states)
+        assert bench.set_parameter("strategy", "rule") == ""
+        assert bench.set_parameter("friction", 0.4) == ""
+        bench.drive(lambda: bench.last("setting.strategy") == 1 and bench.last("friction") == 0.4, "the change")
+        bench.drive(lambda: bench.last("front_share") == pytest.approx(0.9), "another split")
+        assert bench.set_parameter("strategy", "equal") == ""
+        bench.drive(lambda: bench.last("front_share") == 0.5, "the old split")
+        shares = [state["front_share"] for state in bench.states[start:]]
+        steps = [state["dt_s"] for state in bench.states[start + 1 :]]
+        fastest = bench.last("setting.share_rate_per_s")
+        assert all(abs(b - a) <= fastest * dt + 1e-9 for a, b, dt in zip(shares, shares[1:], steps, strict=False))
+        assert bench.set_parameter("friction", 0.9) == ""
+
+    def test_every_parameter_is_described(self, bench) -> None:
+        friction = bench.describe("friction")
+        assert friction.floating_point_range[0].from_value == 0.05
+        assert friction.floating_point_range[0].to_value == 1.5
+        assert "friction" in friction.description
+        assert bench.describe("rate_hz").description.startswith("Control rate, Hz")
+        assert bench.describe("lockstep").read_only
+
+
+def test_friction_may_come_from_its_topic_and_falls_back_when_that_is_stale(bench) -> None:
+    assert bench.set_parameter("friction_source", "road_friction") == ""
+    assert bench.set_parameter("friction_timeout_s", 0.5) == ""
+    sent = [0]
+
+    def send_friction(value: float) -> None:
+        sent[0] += 1
+        if sent[0] % 10 == 0:
+            bench.publish(messages.ROAD_FRICTION, messages.number_message(value))
+
+    bench.drive(lambda: send_friction(0.31) or bench.last("friction") == 0.31, "the topic's friction")
+    bench.drive(lambda: send_friction(NAN) or bench.last("friction") == 0.9, "the parameter's friction")
+    assert bench.set_parameter("friction_source", "parameter") == ""

@@ -1,0 +1,98 @@
+"""How the node starts alone: parameter file, namespace, remaps; one clear line and an exit code when it cannot."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from bench import Bench, Running, arguments
+
+from iwm_power_manager.files import read_yaml
+from iwm_power_manager.nodes import power_manager_config as config
+from iwm_power_manager.ros import messages
+from iwm_power_manager.share import resolve
+
+MODULE = "iwm_power_manager.nodes.power_manager"
+DOMAIN = int(os.environ["ROS_DOMAIN_ID"])
+
+
+def fails_with(folder: Path, args: list[str]) -> str:
+    running = Running(MODULE, args, DOMAIN, folder)
+    assert running.wait() == 1
+    lines = [line for line in running.text().splitlines() if line.strip()]
+    assert len(lines) == 1, running.text()
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("parameters", "expected"),
+    [
+        ({"policy_file": "/nowhere/policy.npz"}, "/nowhere/policy.npz: cannot be read"),
+        ({"policy_file": ""}, "policy_file: is empty"),
+        ({"strategy": "equal", "vehicle_file": "/nowhere/car.yaml"}, "/nowhere/car.yaml: cannot be read"),
+        ({"rate_hz": 1e6}, "parameter rate_hz: 1000000.0 is not allowed; allowed: 10 to 1000"),
+        ({"rate_hz": "fast"}, "parameter rate_hz: 'fast' is not allowed; allowed: 10 to 1000"),
+        ({"strategy": "clever"}, "parameter strategy: 'clever' is not allowed; allowed: equal | rule"),
+        ({"slip_target": 0.3}, "parameter slip_target: 0.3 is not allowed; allowed: at most critical_slip"),
+        ({"cpu_affinity": "first"}, "parameter cpu_affinity: 'first' is no list of processors"),
+        ({"friction": ".nan"}, "parameter friction: nan is not allowed"),
+    ],
+)
+def test_what_it_cannot_start_with_gives_one_line_and_exit_code_1(tmp_path, parameters, expected) -> None:
+    assert expected in fails_with(tmp_path, arguments(parameters))
+
+
+def test_a_damaged_policy_gives_one_line(tmp_path) -> None:
+    damaged = tmp_path / "policy.npz"
+    damaged.write_bytes(b"PK\x03\x04 and then nothing that makes sense")
+    assert "damaged" in fails_with(tmp_path, arguments({"policy_file": damaged}))
+
+
+def test_a_vehicle_with_a_bad_value_is_named_with_its_key(tmp_path) -> None:
+    text = resolve("config/vehicles/jalalmaab_2015.yaml").read_text()
+    car = tmp_path / "car.yaml"
+    car.write_text(text.replace("mass_kg: 800.0", "mass_kg: -800.0"))
+    assert f"{car}: chassis.mass_kg" in fails_with(tmp_path, arguments({"strategy": "equal", "vehicle_file": car}))
+
+
+def test_a_parameter_file_that_is_missing_or_no_yaml_gives_one_line(tmp_path) -> None:
+    line = fails_with(tmp_path, ["--ros-args", "--params-file", "/nowhere/params.yaml"])
+    assert line == "power_manager: /nowhere/params.yaml: cannot be read: No such file or directory"
+    broken = tmp_path / "params.yaml"
+    broken.write_text("power_manager: [")
+    assert f"power_manager: {broken}: line 1" in fails_with(tmp_path, ["--ros-args", "--params-file", str(broken)])
+
+
+def test_it_runs_from_its_parameter_file_in_a_namespace_with_remaps(tmp_path, compiled_law) -> None:
+    params = str(resolve("config/nodes/power_manager.yaml"))
+    args = arguments({"strategy": "equal"}, {"__ns": "/car", "vehicle_speed": "/gps/speed"})
+    args[1:1] = ["--params-file", params]
+    running = Running(MODULE, args, DOMAIN, tmp_path)
+    bench = Bench(DOMAIN, namespace="/car")
+    try:
+        bench.node.destroy_publisher(bench.publishers[messages.VEHICLE_SPEED])
+        bench.publishers[messages.VEHICLE_SPEED] = bench.node.create_publisher(
+            messages.TOPIC_TYPES[messages.VEHICLE_SPEED], "/gps/speed", 1
+        )
+        bench.connect()
+        bench.drive(lambda: bench.mode() == 1, "normal operation")
+        assert running.stop(signal.SIGTERM) == 0
+    finally:
+        running.process.kill()
+        bench.close()
+
+
+def test_the_parameter_file_holds_every_parameter_with_its_default() -> None:
+    path = resolve("config/nodes/power_manager.yaml")
+    assert path.read_text() == config.parameter_file(), "run python -m iwm_power_manager.nodes.power_manager_config"
+    values = read_yaml(path)["/**/power_manager"]["ros__parameters"]
+    flat = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            flat |= {f"{key}.{name}": item for name, item in value.items()}
+        else:
+            flat[key] = value
+    assert flat == {spec.name: spec.default for spec in config.SPECS}
+    assert all(type(flat[spec.name]) is type(spec.default) for spec in config.SPECS)
