@@ -435,10 +435,6 @@ def load_efficiency_map(path: Path | str) -> tuple[FloatArray, FloatArray, Float
         for t in torques:
             if (s, t) not in rows:
                 raise ConfigError(path, "", f"lacks the point speed {s:g}, torque {t:g}", "a full grid")
-    if torques[0] >= 0:
-        mirrored = torques[torques > 0]
-        rows |= {(s, -t): rows[s, t] for s in speeds for t in mirrored}
-        torques = np.concatenate((-mirrored[::-1], torques))
     loss = np.full((len(speeds), len(torques)), np.nan)
     for i, s in enumerate(speeds):
         for j, t in enumerate(torques):
@@ -447,7 +443,12 @@ def load_efficiency_map(path: Path | str) -> tuple[FloatArray, FloatArray, Float
                 loss[i, j] = power / rows[s, t] - power
             elif power < 0:
                 loss[i, j] = -power * (1.0 - rows[s, t])
-    return speeds, torques, _continue_losses(path, speeds, torques, loss)
+    loss = _continue_losses(path, speeds, torques, loss)
+    if torques[0] >= 0:
+        driving = torques > 0
+        torques = np.concatenate((-torques[driving][::-1], torques))
+        loss = np.ascontiguousarray(np.concatenate((loss[:, driving][:, ::-1], loss), axis=1))
+    return speeds, torques, loss
 
 
 def _cell(path: Path, line: int, column: str, text: str, low: float, high: float) -> float:
