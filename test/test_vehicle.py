@@ -1,0 +1,405 @@
+"""Vehicle files: every key with every kind of bad value, curves and maps, and the identity of a car."""
+
+from __future__ import annotations
+
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from iwm_power_manager import files, vehicle
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.model.motor import electrical_power_w, enabled_loss_w
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_efficiency_map, load_vehicle, with_idle_drive, with_params
+from oracles.step import loss_w
+
+FOLDER = share_path("config/vehicles")
+PAPER = FOLDER / "jalalmaab_2015.yaml"
+MAP = share_path("config/motors/siemens_pm_7500w.csv")
+CONTENT = files.read_yaml(PAPER)
+
+
+def _numbers(content, path=()):
+    """Every key of the file that holds one number."""
+    for key, value in content.items():
+        if isinstance(value, dict):
+            yield from _numbers(value, (*path, key))
+        elif isinstance(value, float | int) and path:
+            yield (*path, key)
+
+
+NUMBERS = list(_numbers(CONTENT))
+SECTIONS = [key for key, value in CONTENT.items() if isinstance(value, dict)]
+
+
+def changed(path, value=None, *, drop=False, content=CONTENT):
+    """The file's content with one key replaced or dropped."""
+    content = copy.deepcopy(content)
+    parent = content
+    for key in path[:-1]:
+        parent = parent[key]
+    if drop:
+        del parent[path[-1]]
+    else:
+        parent[path[-1]] = value
+    return content
+
+
+@pytest.fixture
+def refused(monkeypatch):
+    """The error a content is refused with; what YAML makes of a file is tested with `files`."""
+
+    def load(content):
+        monkeypatch.setattr(vehicle.files, "read_yaml", lambda path: content)
+        with pytest.raises(ConfigError) as caught:
+            load_vehicle(PAPER)
+        error = caught.value
+        assert error.file == str(PAPER)
+        assert str(error).startswith(f"{PAPER}: {error.key}: ")
+        assert "\n" not in str(error)
+        return error
+
+    return load
+
+
+@pytest.mark.parametrize("path", NUMBERS, ids=".".join)
+def test_every_number_is_checked(path, refused):
+    key = ".".join(path)
+    for value, words in (
+        ("80.0", "'80.0' is no number"),
+        (None, "None is no number"),
+        (True, "True is no number"),
+        ([1.0], "[1.0] is no number"),
+        (math.nan, "nan is not finite"),
+        (math.inf, "inf is not finite"),
+        (-math.inf, "-inf is not finite"),
+        (1e9, "1000000000.0 is out of range"),
+        (-1e9, "-1000000000.0 is out of range"),
+    ):
+        error = refused(changed(path, value))
+        assert (error.key, error.problem) == (key, words)
+        assert error.allowed
+    missing = refused(changed(path, drop=True))
+    assert (missing.key, missing.problem) == (key, "is missing")
+
+
+@pytest.mark.parametrize("section", SECTIONS)
+def test_unknown_keys_and_sections_that_are_none_are_refused(section, refused):
+    error = refused(changed((section, "mass"), 1.0))
+    assert (error.key, error.problem) == (f"{section}.mass", "is an unknown key")
+    assert error.allowed
+    for value in (None, 3.0, [1.0], "text"):
+        error = refused(changed((section,), value))
+        assert (error.key, error.problem) == (section, f"{value!r} is no mapping")
+    assert refused(changed((section,), drop=True)).problem == "is missing"
+
+
+def test_the_motor_s_loss_section_is_checked_too(refused):
+    assert refused(changed(("motor", "loss", "x"), 1.0)).key == "motor.loss.x"
+    assert refused(changed(("motor", "loss"), 5.0)).key == "motor.loss"
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "key", "allowed"),
+    [
+        (("format",), 2, "format", "1"),
+        (("format",), "1", "format", "1"),
+        (("name",), "", "name", "text that is not empty"),
+        (("name",), "  ", "name", "text that is not empty"),
+        (("name",), 5, "name", "text that is not empty"),
+        (("idle_drive",), "off", "idle_drive", "none | drag | enabled"),
+        (("idle_drive",), None, "idle_drive", "none | drag | enabled"),
+        (("extra",), 1, "extra", None),
+        (("chassis", "cg_height_m"), 0.92, "chassis.cg_height_m", "below 0.92 m"),
+        (("motor", "efficiency_map"), "a.csv", "motor", "loss | efficiency_map"),
+    ],
+)
+def test_single_rules_are_named(path, value, key, allowed, refused):
+    error = refused(changed(path, value))
+    assert error.key == key
+    assert allowed is None or error.allowed == allowed
+
+
+@pytest.mark.parametrize("key", ["format", "name", "idle_drive"])
+def test_every_top_key_is_needed(key, refused):
+    assert refused(changed((key,), drop=True)).key == key
+
+
+def test_a_motor_needs_one_kind_of_loss(refused):
+    assert refused(changed(("motor", "loss"), drop=True)).allowed == "loss | efficiency_map"
+    error = refused(changed(("motor",), {**changed(("motor", "loss"), drop=True)["motor"], "efficiency_map": 5}))
+    assert (error.key, error.problem) == ("motor.efficiency_map", "5 is no file name")
+
+
+@pytest.mark.parametrize(
+    ("section", "small", "large", "may_equal"),
+    [
+        ("motor", "regeneration_zero_below_mps", "regeneration_full_above_mps", False),
+        ("motor", "continuous_torque_nm", "peak_torque_nm", True),
+        ("battery", "charge_full_below_soc", "charge_zero_above_soc", False),
+        ("battery", "discharge_zero_below_soc", "discharge_full_above_soc", False),
+        ("battery", "charge_zero_below_degc", "charge_full_above_degc", False),
+        ("battery", "power_full_below_degc", "power_zero_above_degc", False),
+    ],
+)
+def test_pairs_have_to_be_in_order(section, small, large, may_equal, refused, monkeypatch):
+    low, high = CONTENT[section][small], CONTENT[section][large]
+    swapped = changed((section, small), high, content=changed((section, large), low))
+    assert refused(swapped).key == f"{section}.{large}"
+    same = changed((section, large), low)
+    if may_equal:
+        monkeypatch.setattr(vehicle.files, "read_yaml", lambda path: same)
+        load_vehicle(PAPER)
+    else:
+        error = refused(same)
+        assert (error.key, error.allowed) == (f"{section}.{large}", f"more than {small} = {low}")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "where", "words"),
+    [
+        ("ocv_soc", None, "ocv_soc", "None is no list"),
+        ("ocv_soc", 0.5, "ocv_soc", "0.5 is no list"),
+        ("ocv_soc", [0.0], "ocv_soc", "[0.0] is no list"),
+        ("ocv_soc", [0.0, "a"], "ocv_soc[1]", "'a' is no number"),
+        ("ocv_soc", [0.0, math.nan], "ocv_soc[1]", "nan is not finite"),
+        ("ocv_soc", [0.0, 1.1], "ocv_soc[1]", "1.1 is out of range"),
+        ("ocv_soc", [0.0, 1.0], "ocv_cell_v", "has 11 values"),
+        ("ocv_soc", [i / 11 for i in range(11)], "ocv_soc", "out of order"),
+        ("ocv_soc", [(i + 1) / 11 for i in range(11)], "ocv_soc", "out of order"),
+        ("ocv_soc", [0.0, 0.2, 0.1, *(i / 10 for i in range(3, 11))], "ocv_soc", "out of order"),
+        ("ocv_soc", [0.0, 0.1, 0.1, *(i / 10 for i in range(3, 11))], "ocv_soc", "out of order"),
+        ("ocv_cell_v", [3.3] * 10, "ocv_cell_v", "has 10 values"),
+        ("ocv_cell_v", [3.3] * 10 + [3.2], "ocv_cell_v", "falls"),
+        ("ocv_cell_v", [0.1] * 11, "ocv_cell_v[0]", "0.1 is out of range"),
+    ],
+)
+def test_the_cell_s_curve_is_checked(key, value, where, words, refused):
+    error = refused(changed(("battery", key), value))
+    assert error.key == f"battery.{where}"
+    assert words in error.problem
+
+
+def test_a_missing_curve_is_missing(refused):
+    error = refused(changed(("battery", "ocv_soc"), drop=True))
+    assert (error.key, error.problem) == ("battery.ocv_soc", "is missing")
+
+
+def test_a_flat_curve_is_allowed(monkeypatch):
+    content = changed(("battery", "ocv_cell_v"), [3.3] * 11)
+    monkeypatch.setattr(vehicle.files, "read_yaml", lambda path: content)
+    assert load_vehicle(PAPER).params.battery.ocv_cell_v.tolist() == [3.3] * 11
+
+
+@pytest.mark.parametrize("text", ["chassis:\n  mass_kg: 1\n  mass_kg: 2\n", "- 1\n", "a: [\n", "", "5"])
+def test_what_is_no_vehicle_file_is_refused_with_its_name(tmp_path, text):
+    path = tmp_path / "car.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=r"car\.yaml"):
+        load_vehicle(path)
+    with pytest.raises(ConfigError, match=r"nowhere\.yaml: cannot be read"):
+        load_vehicle(tmp_path / "nowhere.yaml")
+
+
+# --- What comes out -----------------------------------------------------------------------------------------------------
+
+
+def test_the_paper_s_car_has_the_paper_s_numbers():
+    params = load_vehicle(PAPER).params
+    chassis, motor, battery = params.chassis, params.motor, params.battery
+    assert (chassis.mass_kg, chassis.frontal_area_m2, chassis.air_density_kgpm3) == (800.0, 1.66, 1.2)
+    assert (chassis.front_axle_to_cg_m, chassis.rear_axle_to_cg_m, chassis.cg_height_m) == (0.92, 0.92, 0.6)
+    assert (params.wheel.radius_m, motor.max_power_w, motor.regeneration_torque_nm) == (0.33, 7500.0, 80.0)
+    assert (battery.cells_in_series, battery.nominal_cell_voltage_v, battery.capacity_ah) == (72.0, 3.3, 200.0)
+    assert battery.resistance_ohm == 0.063
+    assert battery.ohmic_resistance_ohm + battery.polarisation_resistance_ohm == pytest.approx(0.063)
+
+
+@pytest.mark.parametrize("path", NUMBERS, ids=".".join)
+def test_every_number_of_the_file_arrives_in_the_parameters_and_counts_for_the_car_s_identity(path, monkeypatch):
+    section, key = path[0], path[-1]
+    before = load_vehicle(PAPER)
+    value = CONTENT[section]["loss"][key] if "loss" in path else CONTENT[section][key]
+    content = changed(path, value * (1.0 - 1e-9) if value else 1e-9)
+    monkeypatch.setattr(vehicle.files, "read_yaml", lambda _: content)
+    after = load_vehicle(PAPER)
+    old, new = getattr(before.params, section)._asdict(), getattr(after.params, section)._asdict()
+    different = [name for name, x in old.items() if not np.array_equal(x, new[name])]
+    assert len(different) == 1
+    assert different[0] == key or "loss" in path
+    # The simulated driver is nothing a policy depends on.
+    assert (before.hash == after.hash) == (section == "driver")
+
+
+def test_idle_drive_can_be_replaced():
+    car = load_vehicle(PAPER)
+    assert car.idle_drive == "drag"
+    for name in ("none", "drag", "enabled"):
+        other = load_vehicle(PAPER, name)
+        assert other.idle_drive == name
+        again = with_idle_drive(car, name)
+        assert (again.hash, again.idle_drive, again.params.motor.idle_drive) == (other.hash, name, other.params.motor.idle_drive)
+    assert len({load_vehicle(PAPER, name).hash for name in ("none", "drag", "enabled")}) == 3
+    with pytest.raises(ConfigError, match=r"idle_drive: 'off' is unknown; allowed: none \| drag \| enabled"):
+        load_vehicle(PAPER, "off")
+    with pytest.raises(ConfigError, match="idle_drive"):
+        with_idle_drive(car, "off")
+
+
+def test_a_car_with_other_numbers_is_another_car():
+    car = load_vehicle(PAPER)
+    heavy = with_params(car, "heavy", car.params._replace(chassis=car.params.chassis._replace(mass_kg=900.0)))
+    assert (heavy.name, heavy.idle_drive, heavy.path) == ("heavy", "drag", car.path)
+    assert heavy.hash != car.hash
+    assert with_params(heavy, "light again", car.params).hash == car.hash
+    assert len(car.hash) == 16
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_vehicle_we_ship_loads_under_its_own_name(path):
+    car = load_vehicle(path)
+    assert car.name == path.stem
+    assert all(isinstance(x, float) for x in car.params.chassis)
+
+
+def test_shipped_vehicles_differ_from_the_paper_s_car_in_the_motor_only():
+    car = load_vehicle(PAPER).params
+    for name in ("direct_drive_hub", "jalalmaab_2015_map"):
+        other = load_vehicle(FOLDER / f"{name}.yaml").params
+        for section in (s for s in car._fields if s != "motor"):
+            for ours, theirs in zip(getattr(car, section), getattr(other, section), strict=True):
+                assert np.array_equal(ours, theirs)
+
+
+def test_the_hub_motor_has_its_own_losses():
+    motor = load_vehicle(FOLDER / "direct_drive_hub.yaml").params.motor
+    w, t = 50.0, 60.0
+    assert enabled_loss_w(t, w, motor) == pytest.approx(40 + 1.57 * w + 0.0166 * w**2 + 1.50 * t + 0.045 * t**2)
+
+
+# --- Motor maps -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_shipped_map_is_that_of_the_loss_coefficients():
+    motor = load_vehicle(PAPER).params.motor
+    rows = np.genfromtxt(MAP, delimiter=",", names=True)
+    for w, t, efficiency in zip(rows["speed_rad_s"], rows["torque_nm"], rows["efficiency"], strict=True):
+        assert efficiency == pytest.approx(w * t / (w * t + loss_w(t, w, motor)), abs=6e-9)
+
+
+def test_a_map_gives_back_its_efficiencies_driving_and_regenerating():
+    motor = load_vehicle(FOLDER / "jalalmaab_2015_map.yaml").params.motor
+    rows = np.genfromtxt(MAP, delimiter=",", names=True)
+    for w, t, efficiency in zip(rows["speed_rad_s"], rows["torque_nm"], rows["efficiency"], strict=True):
+        w, t = float(w), float(t)
+        assert w * t / electrical_power_w(t, w, motor) == pytest.approx(efficiency, rel=1e-9)
+        assert enabled_loss_w(-t, w, motor) == pytest.approx(enabled_loss_w(t, w, motor))
+
+
+def test_between_its_points_the_map_is_close_to_the_coefficients():
+    mapped = load_vehicle(FOLDER / "jalalmaab_2015_map.yaml").params.motor
+    motor = load_vehicle(PAPER).params.motor
+    for w in np.linspace(3.0, 100.0, 23):
+        for t in np.linspace(-80.0, 150.0, 24):
+            ours, theirs = enabled_loss_w(float(t), float(w), mapped), enabled_loss_w(float(t), float(w), motor)
+            assert ours == pytest.approx(theirs, rel=0.03)
+
+
+def write(folder: Path, *rows: str, header: str = "speed_rad_s,torque_nm,efficiency") -> Path:
+    path = folder / "map.csv"
+    path.write_text("\n".join((header, *rows)) + "\n")
+    return path
+
+
+def test_a_map_of_both_signs_is_taken_as_it_is(tmp_path):
+    path = write(tmp_path, "10,-20,0.5", "10,20,0.8", "50,-20,0.7", "50,20,0.9")
+    speed, torque, loss = load_efficiency_map(path)
+    assert (speed.tolist(), torque.tolist()) == ([10.0, 50.0], [-20.0, 20.0])
+    # 200 W mechanical: half of it is lost; 200 / 0.8 - 200 W; and so on.
+    assert loss == pytest.approx(np.array([[100.0, 50.0], [300.0, 1000.0 / 0.9 - 1000.0]]))
+
+
+def test_a_map_without_negative_torque_is_mirrored(tmp_path):
+    path = write(tmp_path, "10,20,0.8", "10,40,0.5", "50,20,0.9", "50,40,0.9")
+    _, torque, loss = load_efficiency_map(path)
+    assert torque.tolist() == [-40.0, -20.0, 20.0, 40.0]
+    assert np.array_equal(loss, loss[:, ::-1])
+
+
+def test_at_zero_speed_or_torque_the_loss_is_continued_from_the_neighbours(tmp_path):
+    path = write(tmp_path, *(f"{w},{t},{0 if w * t == 0 else 0.8}" for w in (0, 10, 20) for t in (-20, 0, 40)))
+    _, _, loss = load_efficiency_map(path)
+    # Braking loses 0.2 * 200 W, driving 400 W / 0.8 - 400 W; torque 0 lies a third of the way.
+    assert loss[1] == pytest.approx([40.0, 40.0 + (100.0 - 40.0) / 3.0, 100.0])
+    assert loss[0] == pytest.approx(loss[1])
+
+
+def test_spaces_blank_lines_and_the_order_of_rows_do_not_matter(tmp_path):
+    rows = ("10,20,0.8", "10,40,0.5", "50,20,0.9", "50,40,0.85")
+    tidy = load_efficiency_map(write(tmp_path, *rows))
+    messy = load_efficiency_map(
+        write(tmp_path, rows[3], "", f" {rows[0]} ".replace(",", " , "), rows[2], rows[1], header="speed_rad_s, torque_nm ,efficiency")
+    )
+    assert all(np.array_equal(a, b) for a, b in zip(tidy, messy, strict=True))
+
+
+GOOD = ("10,20,0.8", "10,40,0.5", "50,20,0.9", "50,40,0.85")
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ((*GOOD, "60,20"), "line 6: has 2 values; allowed: 3"),
+        ((*GOOD, "60,20,0.5,1"), "line 6: has 4 values; allowed: 3"),
+        ((*GOOD, "fast,20,0.5"), "line 6, speed_rad_s: 'fast' is no number; allowed: 0 to 2000"),
+        ((*GOOD, "60,,0.5"), "line 6, torque_nm: '' is no number; allowed: -20000 to 20000"),
+        ((*GOOD, "60,20,nan"), "line 6, efficiency: nan is not finite; allowed: 0 to 1"),
+        ((*GOOD, "inf,20,0.5"), "line 6, speed_rad_s: inf is not finite; allowed: 0 to 2000"),
+        ((*GOOD, "-1,20,0.5"), "line 6, speed_rad_s: -1.0 is out of range; allowed: 0 to 2000"),
+        ((*GOOD, "2001,20,0.5"), "line 6, speed_rad_s: 2001.0 is out of range; allowed: 0 to 2000"),
+        ((*GOOD, "60,30000,0.5"), "line 6, torque_nm: 30000.0 is out of range; allowed: -20000 to 20000"),
+        ((*GOOD, "60,20,85"), "line 6, efficiency: 85.0 is out of range; allowed: 0 to 1"),
+        ((*GOOD, "60,20,-0.1"), "line 6, efficiency: -0.1 is out of range; allowed: 0 to 1"),
+        ((*GOOD, "60,20,0"), "line 6: efficiency 0 means an infinite loss; allowed: above 0, up to 1"),
+        ((*GOOD, "50,40,0.85"), "line 6: repeats speed 50, torque 40"),
+        ((*GOOD, "60,20,0.5"), "map.csv: lacks the point speed 60, torque 40; allowed: a full grid"),
+        (GOOD[:2], "has 1 speeds and 2 torques; allowed: 2 or more of each"),
+        (GOOD[::2], "has 2 speeds and 1 torques; allowed: 2 or more of each"),
+        ((), "has 0 speeds and 0 torques; allowed: 2 or more of each"),
+        (("0,0,0", "0,20,0", "10,0,0", "10,-20,0.5", "0,-20,0"), "lacks the point speed 10, torque 20"),
+        (("0,0,0", "0,20,0", "0,-20,0", "0,40,0"), "has 1 speeds"),
+    ],
+)
+def test_a_bad_row_is_named(tmp_path, rows, words):
+    with pytest.raises(ConfigError) as caught:
+        load_efficiency_map(write(tmp_path, *rows))
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("header", ["", "speed,torque,efficiency", "torque_nm,speed_rad_s,efficiency"])
+def test_a_wrong_header_is_named(tmp_path, header):
+    with pytest.raises(ConfigError, match=r"map\.csv: line 1: .* is no header; allowed: speed_rad_s,torque_nm,efficiency"):
+        load_efficiency_map(write(tmp_path, *GOOD, header=header))
+
+
+def test_an_empty_or_absent_file_is_named(tmp_path):
+    path = tmp_path / "map.csv"
+    with pytest.raises(ConfigError, match=r"map\.csv: cannot be read"):
+        load_efficiency_map(path)
+    path.write_text("")
+    with pytest.raises(ConfigError, match=r"map\.csv: line 1: '' is no header"):
+        load_efficiency_map(path)
+
+
+def test_a_map_s_path_is_seen_from_the_vehicle_file(tmp_path):
+    (tmp_path / "cars").mkdir()
+    write(tmp_path, *GOOD)
+    text = (FOLDER / "jalalmaab_2015_map.yaml").read_text().replace("../motors/siemens_pm_7500w.csv", "../map.csv")
+    (tmp_path / "cars" / "car.yaml").write_text(text)
+    assert load_vehicle(tmp_path / "cars" / "car.yaml").params.motor.map_torque_nm.tolist() == [-40.0, -20.0, 20.0, 40.0]
+    (tmp_path / "map.csv").unlink()
+    with pytest.raises(ConfigError, match=r"map\.csv: cannot be read"):
+        load_vehicle(tmp_path / "cars" / "car.yaml")
