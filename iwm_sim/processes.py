@@ -13,6 +13,8 @@ from typing import Self
 from iwm_power_manager.errors import IwmError
 
 _LAST_LINES = 12
+#: How long a child that is asked to end (SIGTERM) may take before it is killed.
+ASK_S = 5.0
 
 
 class ChildError(IwmError):
@@ -95,7 +97,7 @@ class Child:
             return
         self.process.terminate()
         try:
-            self.process.wait(5.0)
+            self.process.wait(ASK_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
