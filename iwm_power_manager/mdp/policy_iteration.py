@@ -449,7 +449,7 @@ def solve(
     history: list[Iteration] = []
     share_of = np.append(share, 0.0)  # the last entry serves GATED = -1
     residual_target = tolerance_j * (1.0 - model.discount) / model.discount if model.discount > 0.0 else np.inf
-    rounding = (model.demand.shape[1] + 16) * np.finfo(np.float64).eps / (1.0 - model.discount)
+    rounding = (model.demand.shape[1] + 16) * float(np.finfo(np.float64).eps) / (1.0 - model.discount)
     forcing = _FORCING
     smallest = np.inf
     while True:
