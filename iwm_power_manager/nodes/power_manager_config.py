@@ -273,9 +273,5 @@ def parameter_file() -> str:
         "power_manager",
         SPECS,
         "Parameters of the power manager, all of them, with their defaults. Ranges: docs/interface.md, or "
-        "`ros2 param describe`. Written by `python -m iwm_power_manager.nodes.power_manager_config`.",
+        "`ros2 param describe`. Written by scripts/update_interface.",
     )
-
-
-if __name__ == "__main__":
-    print(parameter_file(), end="")

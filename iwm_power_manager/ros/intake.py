@@ -1,8 +1,8 @@
 """Inputs that are fetched when they are needed, instead of waking the node one by one.
 
 An executor spends some 100 us or more on every message it dispatches; a take costs a few. A control step wants the
-newest message of every topic at one moment, so it takes them then. A publisher that floods a topic cannot starve the loop
-either: of a queue of one, whatever comes between two steps overwrites itself.
+newest message of every topic at one moment, so it takes them then. A publisher that floods a topic cannot starve the
+loop either: of a queue of one, whatever comes between two steps overwrites itself.
 """
 
 from __future__ import annotations

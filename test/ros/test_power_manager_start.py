@@ -86,7 +86,7 @@ def test_it_runs_from_its_parameter_file_in_a_namespace_with_remaps(tmp_path, co
 
 def test_the_parameter_file_holds_every_parameter_with_its_default() -> None:
     path = resolve("config/nodes/power_manager.yaml")
-    assert path.read_text() == config.parameter_file(), "run python -m iwm_power_manager.nodes.power_manager_config"
+    assert path.read_text() == config.parameter_file(), "run scripts/update_interface"
     values = read_yaml(path)["/**/power_manager"]["ros__parameters"]
     flat = {}
     for key, value in values.items():

@@ -1,0 +1,166 @@
+"""What diagnostics say, from plain numbers."""
+
+from __future__ import annotations
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from iwm_power_manager.control.inputs import Violation, WheelVerdict
+from iwm_power_manager.control.monitor import Tally
+from iwm_power_manager.control.supervision import (
+    MODE_DEGRADED,
+    MODE_NORMAL,
+    MODE_RECOVERING,
+    STALE_DEMAND,
+    STALE_SPEED,
+    Supervision,
+)
+from iwm_power_manager.nodes.power_manager_report import ChangeDetector
+from iwm_power_manager.ros.diagnostics import (
+    ERROR,
+    OK,
+    WARN,
+    InputReport,
+    LoopStatistics,
+    Status,
+    control_status,
+    to_message,
+)
+
+LIMITS = {
+    "execution_warn_us": 1000.0,
+    "execution_error_us": 2000.0,
+    "periodicity_warn_hz": 5.0,
+    "periodicity_error_hz": 10.0,
+}
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+GOOD = (WheelVerdict.GOOD,) * 4
+SECOND = 10**9
+
+
+class TestLoop:
+    @pytest.mark.parametrize(("execution_us", "level"), [(999.0, OK), (1001.0, WARN), (1999.0, WARN), (2001.0, ERROR)])
+    def test_execution_time_is_judged_by_its_mean(self, execution_us, level) -> None:
+        loop = LoopStatistics()
+        for offset in (-500.0, 500.0):
+            loop.add(0.01, (execution_us + offset) * 1e-6)
+        status = loop.report(100.0, LIMITS)
+        assert status.level == level
+        assert status.values["execution time, max (us)"] == f"{execution_us + 500.0:.0f}"
+
+    @pytest.mark.parametrize(
+        ("rate_hz", "level"), [(100.0, OK), (95.1, OK), (94.9, WARN), (105.1, WARN), (89.9, ERROR), (111.0, ERROR)]
+    )
+    def test_the_rate_is_judged_by_its_deviation(self, rate_hz, level) -> None:
+        loop = LoopStatistics()
+        for _ in range(10):
+            loop.add(1.0 / rate_hz, 1e-4)
+        assert loop.report(100.0, LIMITS).level == level
+
+    def test_a_report_starts_counting_anew_but_keeps_the_total(self) -> None:
+        loop = LoopStatistics()
+        loop.add(None, 0.5)
+        loop.add(0.02, 1e-4)
+        loop.report(100.0, LIMITS)
+        loop.add(0.01, 1e-4)
+        status = loop.report(100.0, LIMITS)
+        assert status.level == OK
+        assert status.values["steps"] == "3"
+        assert status.values["steps since the last report"] == "1"
+        assert status.values["period, max (ms)"] == status.values["period, min (ms)"] == "10.000"
+
+    def test_without_a_step_a_loop_with_a_rate_is_in_error_and_lockstep_is_not(self) -> None:
+        assert LoopStatistics().report(100.0, LIMITS).level == ERROR
+        assert LoopStatistics().report(None, LIMITS).level == OK
+
+    def test_in_lockstep_the_rate_is_told_and_not_judged(self) -> None:
+        loop = LoopStatistics()
+        loop.add(0.5, 1e-4)
+        status = loop.report(None, LIMITS)
+        assert status.level == OK
+        assert status.values["rate, mean (Hz)"] == "2.00"
+
+
+class TestInputs:
+    def tallies(self) -> dict[str, Tally]:
+        return {"vehicle_speed": Tally(), "power_demand": Tally()}
+
+    def test_rates_are_counted_between_reports(self) -> None:
+        tallies, report = self.tallies(), InputReport()
+        report.report(0, tallies, 0, GOOD, WHEELS)
+        for i in range(50):
+            tallies["vehicle_speed"].note(Violation.NONE, i)
+        status = report.report(SECOND // 2, tallies, 0, GOOD, WHEELS)
+        assert status.values["vehicle_speed: rate (Hz)"] == "100.0"
+        assert status.values["power_demand: rate (Hz)"] == "0.0"
+        assert status.values["power_demand: age (s)"] == "inf"
+        assert status.level == OK
+
+    def test_a_missing_input_is_an_error_with_its_reason(self) -> None:
+        tallies = self.tallies()
+        tallies["vehicle_speed"].note(Violation.STAMP_TOO_OLD, 0)
+        status = InputReport().report(0, tallies, STALE_SPEED | STALE_DEMAND, GOOD, WHEELS)
+        assert status.level == ERROR
+        assert status.message == "vehicle_speed is missing (stamp too old); power_demand is missing"
+
+    def test_a_dropped_message_is_a_warning_once(self) -> None:
+        tallies, report = self.tallies(), InputReport()
+        tallies["vehicle_speed"].note(Violation.NOT_FINITE, 0)
+        first = report.report(0, tallies, 0, GOOD, WHEELS)
+        assert (first.level, first.message) == (WARN, "vehicle_speed: not finite")
+        assert first.values["vehicle_speed: dropped, not finite"] == "1"
+        assert report.report(SECOND, tallies, 0, GOOD, WHEELS).level == OK
+
+    def test_a_message_dropped_before_a_good_one_is_still_told(self) -> None:
+        tallies = self.tallies()
+        tallies["vehicle_speed"].note(Violation.NOT_FINITE, 0)
+        tallies["vehicle_speed"].note(Violation.NONE, 0)
+        assert InputReport().report(0, tallies, 0, GOOD, WHEELS).message == "vehicle_speed: dropped"
+
+    def test_a_lost_wheel_is_a_warning(self) -> None:
+        verdicts = (WheelVerdict.GOOD, WheelVerdict.STUCK, WheelVerdict.GOOD, WheelVerdict.GOOD)
+        status = InputReport().report(0, self.tallies(), 0, verdicts, WHEELS)
+        assert (status.level, status.message) == (WARN, "wheel front_right is not believed (stuck)")
+        assert status.values["wheel front_right"] == "stuck"
+
+
+class TestControl:
+    def test_normal_operation_is_ok_and_tells_what_binds(self) -> None:
+        supervision = Supervision(MODE_NORMAL, 0, 1.0, 1.0, 1.0)
+        status = control_status("active", supervision, 2, 2 | 32, {"gate": 7}, "sdp")
+        assert (status.level, status.message) == (OK, "normal")
+        assert status.values["gate"] == "rear"
+        assert status.values["limits that bind"] == "regeneration, slew"
+        assert status.values["gate: steps since the last report"] == "7"
+        assert status.values["degraded reason"] == "none"
+
+    def test_degraded_is_an_error_with_its_reason(self) -> None:
+        supervision = Supervision(MODE_DEGRADED, STALE_DEMAND, 0.25, 1.0, 0.0)
+        status = control_status("active", supervision, 0, 0, {}, "sdp")
+        assert (status.level, status.message) == (ERROR, "degraded: power_demand missing")
+        assert status.values["motor torque allowed (%)"] == "25"
+
+    def test_recovering_is_a_warning(self) -> None:
+        status = control_status("active", Supervision(MODE_RECOVERING, 0, 0.5, 1.0, 1.0), 0, 0, {}, "sdp")
+        assert (status.level, status.message) == (WARN, "recovering")
+
+    def test_a_node_that_is_not_active_is_ok_and_says_what_it_is(self) -> None:
+        status = control_status("inactive", Supervision(), 0, 0, {}, "sdp")
+        assert (status.level, status.message) == (OK, "inactive")
+
+
+def test_the_message_carries_stamp_names_levels_and_values() -> None:
+    message = to_message(3 * SECOND + 5, "node", [Status("part", ERROR, "broken", {"key": "value"})])
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (3, 5)
+    status = message.status[0]
+    assert (status.name, status.level, status.message) == ("node: part", DiagnosticStatus.ERROR, "broken")
+    assert (status.values[0].key, status.values[0].value) == ("key", "value")
+
+
+def test_a_change_is_told_once_and_not_too_often() -> None:
+    changes = ChangeDetector(0.1)
+    assert changes.changed("a", 0.0)
+    assert not changes.changed("a", 1.0)
+    assert changes.changed("b", 1.0)
+    assert not changes.changed("c", 1.05)
+    assert changes.changed("c", 1.2)
