@@ -143,9 +143,7 @@ class Policy:
         cost = np.ascontiguousarray(self.cost_j).reshape(rows, -1)
         ahead = np.empty_like(cost)
         columns = cost.shape[1]
-        expect_over_demand(
-            self.chain.matrix, cost, columns, columns // problem.speed_mps.size, 0, columns, ahead
-        )
+        expect_over_demand(self.chain.matrix, cost, columns, columns // problem.speed_mps.size, 0, columns, ahead)
         return PolicyTable(
             power_w=problem.power_w,
             speed_mps=problem.speed_mps,

@@ -473,7 +473,7 @@ def _continue_losses(path: Path, speeds: FloatArray, torques: FloatArray, loss: 
 
 
 def _hash(params: VehicleParams) -> str:
-    """Hash over every number except the simulated driver's, which no policy depends on."""
+    """Hash over every number a policy depends on: all but the simulated driver's, of which it knows the speed floor."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, np.ndarray):
@@ -485,6 +485,7 @@ def _hash(params: VehicleParams) -> str:
         for section in params._fields
         if section != "driver"
     }
+    content["driver"] = {"power_speed_floor_mps": plain(params.driver.power_speed_floor_mps)}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -7,8 +7,8 @@ the next demand, given demand i.
 Dependence on speed
 -------------------
 The paper's chain knows the demand only. But 3 kW at 2 m/s is a start that will be over in a second, and 3 kW at 25 m/s
-is cruising; how long a choice of the split will pay is just what the chain is to tell. With `demand_by_speed` there is a
-matrix for each point of the speed axis, counted from the steps that end near that speed, and mixed with the chain of
+is cruising; how long a choice of the split will pay is just what the chain is to tell. With `demand_by_speed` there is
+a matrix for each point of the speed axis, counted from the steps that end near that speed, and mixed with the chain of
 all speeds where there are few. The solver's structure stays: the next speed does not depend on the next demand.
 
 Rows without data

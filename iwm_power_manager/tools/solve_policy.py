@@ -30,8 +30,8 @@ from iwm_power_manager.mdp.demand import (
     THIN_ROW_STEPS,
     DemandChain,
     Source,
-    cycle_source,
     chain_of,
+    cycle_source,
     signal_source,
 )
 from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
@@ -99,7 +99,7 @@ def parser() -> argparse.ArgumentParser:
         "--friction", nargs="+", type=float, metavar="MU", help="peak friction coefficient(s): one policy each"
     )
     problem.add_argument(
-        "--grid", default="fine", metavar="NAME|FILE", help="paper, fine or a YAML file (default: %(default)s)"
+        "--grid", default="fine", metavar="NAME|FILE", help="paper, fine, coupled or a YAML file (default: %(default)s)"
     )
     problem.add_argument("--idle-drive", choices=sorted(IDLE_DRIVES), help="replaces the car's idle_drive")
     problem.add_argument("--discount", type=float, metavar="GAMMA", help="replaces the grid's discount")

@@ -11,7 +11,10 @@ from iwm_power_manager.mdp.policy_iteration import Model, list_cells
 
 
 class Raw(NamedTuple):
-    """A problem before it is packed: demand[G, P, P], cost[P, C, U], lower corner[P, C, U, 3], fraction[P, C, U, 3], gated[P, C]."""
+    """A problem before it is packed.
+
+    demand[G, P, P], cost[P, C, U], lower corner[P, C, U, 3], fraction[P, C, U, 3], gated[P, C]
+    """
 
     discount: float
     demand: np.ndarray
