@@ -9,7 +9,8 @@ with the 1/N that eq. 25 lacks; without it the number grows with the length of t
 
 What the resistance comes out as hangs on the circuit's constant voltage. An LFP cell at 80 % charge stands above its
 nominal 3.3 V, so that a model at nominal voltage already draws too much current and compensates with a resistance that
-is too small. So the fit is made twice: at the nominal voltage, and with the voltage free as well.
+is too small. So the fit is made three times: at the nominal voltage, at the mean open-circuit voltage the plant had,
+and with the voltage free as well; voltage and resistance can stand in for each other, as the errors show.
 """
 
 from __future__ import annotations
@@ -66,12 +67,14 @@ class Fit(NamedTuple):
     Attributes
     ----------
     nominal : resistance fitted, voltage nominal
+    plant : resistance fitted, voltage the plant's mean open-circuit voltage
     free : both fitted
     file : the circuit the vehicle's file has, for comparison
-    comparison : of the first cycle, with `free` (Fig. 7)
+    comparison : of the first cycle, with `plant` (Fig. 7)
     """
 
     nominal: Estimate
+    plant: Estimate
     free: Estimate
     file: Estimate
     comparison: Comparison
@@ -83,6 +86,7 @@ class Fit(NamedTuple):
         lines = [head]
         for name, made in (
             ("R fitted, nominal voltage", self.nominal),
+            ("R fitted, plant's mean voltage", self.plant),
             ("R and voltage fitted", self.free),
             ("vehicle file", self.file),
         ):
@@ -97,6 +101,7 @@ class Fit(NamedTuple):
         """The result as plain values."""
         return {
             "nominal": self.nominal._asdict(),
+            "plant": self.plant._asdict(),
             "free": self.free._asdict(),
             "file": self.file._asdict(),
             "paper_resistance_ohm": PAPER_RESISTANCE_OHM,
@@ -137,12 +142,15 @@ def fit(
             {name: float(np.sqrt(np.mean(errors))) for name, errors in squares.items()},
         )
 
-    alone = minimize_scalar(
-        lambda ohm: estimate(ohm, nominal_v).rmse,
-        bounds=(0.0, _HIGHEST_OHM),
-        method="bounded",
-        options={"xatol": 1e-6},
-    )
+    def fitted_at(voltage_v: float) -> Estimate:
+        found = minimize_scalar(
+            lambda ohm: estimate(ohm, voltage_v).rmse,
+            bounds=(0.0, _HIGHEST_OHM),
+            method="bounded",
+            options={"xatol": 1e-6},
+        )
+        return estimate(found.x, voltage_v)
+
     both = minimize(
         lambda x: 1e6 * estimate(x[0], x[1] * nominal_v).rmse,
         x0=(battery.resistance_ohm, 1.01),
@@ -150,12 +158,14 @@ def fit(
         method="Nelder-Mead",
         options={"xatol": 1e-6, "fatol": 1e-6},
     )
-    free = estimate(both.x[0], both.x[1] * nominal_v)
+    cells_v = np.interp(np.concatenate([run["soc"] for run in runs.values()]), battery.ocv_soc, battery.ocv_cell_v)
+    plant = fitted_at(battery.cells_in_series * float(np.mean(cells_v)))
     return Fit(
-        nominal=estimate(alone.x, nominal_v),
-        free=free,
+        nominal=fitted_at(nominal_v),
+        plant=plant,
+        free=estimate(both.x[0], both.x[1] * nominal_v),
         file=estimate(battery.resistance_ohm, nominal_v),
-        comparison=_comparison(vehicle, idle_drive, cycles[0], friction, soc, runs, free, battery),
+        comparison=_comparison(vehicle, idle_drive, cycles[0], friction, soc, runs, plant, battery),
     )
 
 

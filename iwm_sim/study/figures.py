@@ -291,6 +291,20 @@ def transition_matrix(probability: ArrayLike, power_w: ArrayLike) -> Figure:
 
 
 @_styled
+def switching_frontier(families: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> Figure:
+    """Saving over changes of the front share a minute: for each strategy, (changes, saving in %) along its price."""
+    figure, (axis,) = _axes(1, height_in=3.6)
+    for index, (name, (changes, saving)) in enumerate(families.items()):
+        axis.plot(changes, saving, "os^Dv"[index % 5] + "-", color=COLOURS[index % 6], markersize=4, label=name)
+    axis.set_xscale("symlog", linthresh=1.0)
+    axis.set_xlim(left=0.0)
+    axis.set_xlabel("Changes of the front share, 1/min")
+    axis.set_ylabel("Saving against equal split, %")
+    axis.legend(loc="lower right")
+    return figure
+
+
+@_styled
 def bars_by_cycle(
     cycles: Sequence[str],
     values: Mapping[str, Sequence[float]],

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from iwm_sim.study.cases import policy_of
 TRAINING_CYCLES = tuple(f"config/cycles/{name}.csv" for name in ("ftp75", "hwfet", "nycc"))
 
 #: Grid of a policy that is solved because none was found.
-DEFAULT_GRID = "fine"
+DEFAULT_GRID = "coupled"
 
 
 class PolicySource:
@@ -104,7 +106,7 @@ def solved(
     Raises
     ------
     IwmError
-        It cannot be solved or written; the reason stands on standard error.
+        It cannot be solved or written.
     """
     grid_file = grid_path(grid)
     digest = hashlib.sha256(f"{vehicle.hash} {friction!r} {jit.source_hash()}".encode())
@@ -119,9 +121,11 @@ def solved(
         arguments = ["--vehicle", str(vehicle.path), "--idle-drive", vehicle.idle_drive, "--friction", repr(friction)]
         for cycle in cycles:
             arguments += ["--cycle", str(resolve(cycle))]
-        code = solve_policy.main([*arguments, "--grid", str(grid_file), "--output", str(file), "--quiet"])
+        complaints = io.StringIO()
+        with contextlib.redirect_stderr(complaints):
+            code = solve_policy.main([*arguments, "--grid", str(grid_file), "--output", str(file), "--quiet"])
         if code not in (solve_policy.SOLVED, solve_policy.UNSOLVED):
-            raise IwmError(f"no policy on grid {grid} for {vehicle.path}, friction {friction:g}")
+            raise IwmError(complaints.getvalue().strip().removeprefix("solve_policy: error: "))
     return str(file)
 
 

@@ -1,12 +1,491 @@
-"""All tables and figures of the paper, and what beats them."""
+"""All tables and figures of the paper, and what beats them: drives everything and gathers the numbers.
+
+The result is plain values (`study.json`), from which `pages` makes tables, and a few series for the figures.
+"""
 
 from __future__ import annotations
 
+import functools
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from iwm_power_manager.errors import IwmError
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from iwm_power_manager import __version__
+from iwm_power_manager.control.types import GATE_MODES, default_settings
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import atomic_write
+from iwm_power_manager.policy import Policy
+from iwm_power_manager.vehicle import pack_energy_wh
+from iwm_sim.study import battery_fit, cases, criteria, pages, paper, sensitivity, skid
+from iwm_sim.study.cases import Case, Change, Result, Rule, SensorNoise
+from iwm_sim.study.driving import on_all_cores, warm_up
+from iwm_sim.study.policies import PolicySource, solved
+
+FloatArray = npt.NDArray[np.float64]
+
+FORMAT = 1
+IDLE_DRIVES = ("none", "drag")
+#: The strategy that plays our policy.
+STRATEGY = "sdp_lookahead"
+
+#: Grids of the paper's formulation, with and without Table 2 in it.
+PAPER_GRID, PAPER_GRID_WITHOUT = "paper", "paper_without_skid_avoidance"
+
+#: The paper decides every 0.1 s.
+PAPER_PERIOD_S = 0.1
+
+#: Power a change has to save, W, of the strongest rival in the tables.
+RIVAL_SWITCHING_W = (60.0, 100.0)
+
+#: The switching frontier: cycle and road, and the prices along it.
+FRONTIER_CYCLE, FRONTIER_FRICTION = "udds", 0.9
+FRONTIER_POWERS_W = (0.0, 15.0, 30.0, 60.0, 100.0, 200.0, 400.0)
+FRONTIER_COSTS_J = (0.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
+FRONTIER_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+
+ROBUSTNESS_CYCLES = ("hwfet", "udds")
+
+#: Where and when Figures 14 and 15 look.
+WINDOW_CYCLE, WINDOW_FRICTION, WINDOW_S = "udds", 0.2, (345.0, 430.0)
+_WINDOW_SIGNALS = ("time_s", "front_power_w", "rear_power_w", "front_slip", "rear_slip")
+
+#: Loss coefficients of a direct-drive hub motor, the second set of docs/model.md.
+HUB_MOTOR = (
+    Change("motor", "loss_constant_w", 40.0),
+    Change("motor", "loss_linear_speed", 1.57),
+    Change("motor", "loss_quadratic_speed", 0.0166),
+    Change("motor", "loss_linear_torque", 1.50),
+    Change("motor", "loss_quadratic_torque", 0.045),
+)
+
+#: What stands in a row of the study's JSON; what is the same for all rows stands there once.
+_KEPT = (
+    *("cycle", "friction", "idle_drive", "label", "strategy", "delta_soc_percent", "wh_per_km", "distance_m"),
+    *("saving_percent", "share_of_possible", "same_distance_as_equal", "rms_speed_error_mps", "max_speed_error_mps"),
+    *("trace_held", "trace_excess_mps", "min_slip", "max_slip", "locked_s", "longest_locked_s"),
+    *("share_changes_per_min", "rms_jerk_mps3", "max_torque_rate_nmps"),
+)
 
 
-def study(output: Path, *, vehicle: str, policy: str, jobs: int, quiet: bool) -> None:
-    """Make the whole study."""
-    raise IwmError(f"the study for {output} is not part of this version yet")
+class Material(NamedTuple):
+    """What the figures need beyond the study's JSON."""
+
+    battery: battery_fit.Fit
+    rule: Rule
+    convergence: tuple[FloatArray, FloatArray]
+    window: dict[str, dict[str, FloatArray]]
+    chain: tuple[FloatArray, FloatArray]
+
+
+class _Plan(NamedTuple):
+    """Cases by the part of the study they are for."""
+
+    cells: list[Case]
+    gates: list[Case]
+    frontier: list[Case]
+    robustness: list[tuple[str, Case]]
+
+
+def study(
+    output: Path, *, vehicle: str, policy: str, jobs: int, quiet: bool, cycles: Sequence[str] = paper.CYCLES
+) -> dict[str, Any]:
+    """Make the whole study and write it into a folder: `study.json`, `study.html`, `study.md`, `figures/`.
+
+    Parameters
+    ----------
+    output : folder, made if it is not there
+    vehicle, policy : car, and folder or file of our policies for it
+    jobs : processes
+    quiet : no progress
+    cycles : driven in the tables; the first one is also that of the frontier, the robustness and the slips if the
+        usual ones are not among them
+    """
+    started = time.perf_counter()
+    try:
+        (output / "figures").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(output, "", f"cannot be created: {error.strerror}", "a folder") from None
+    say = _silent if quiet else _say
+    ours = _our_policies(vehicle, policy, say)
+    paper_policies = {
+        grid: {key: solved(_car(vehicle, key[0]), key[1], grid, say) for key in ours}
+        for grid in (PAPER_GRID, PAPER_GRID_WITHOUT)
+    }
+    warm_up(_warming(vehicle, cycles[0], ours), say)
+
+    with tqdm(total=1, unit="run", file=sys.stderr, disable=quiet, leave=False) as bar:
+        rules = _rules(vehicle, ours, jobs)
+        plan = _plan(vehicle, cycles, ours, paper_policies, rules)
+        tasks: list[Callable[[], Any]] = [functools.partial(cases.result, case) for case in _all(plan)]
+        stops = _stops(vehicle, ours)
+        tasks += [functools.partial(battery_fit.fit, vehicle, IDLE_DRIVES[0], _fit_cycles(cycles))]
+        tasks += [functools.partial(_all_stops, stops)]
+        bar.total = len(tasks)
+        bar.refresh()
+        made = on_all_cores(_call, tasks, jobs, lambda _: bar.update())
+    results: list[Result] = made[: len(_all(plan))]
+    content = _content(vehicle, plan, results, made[-2], made[-1], ours, paper_policies)
+    key = (IDLE_DRIVES[0], paper.FRICTIONS[0])
+    convergence = cases.policy_of(paper_policies[PAPER_GRID][key])
+    material = Material(
+        battery=made[-2],
+        rule=rules[key],
+        convergence=_convergence(convergence),
+        window=_window(results),
+        chain=(convergence.chain.probability, convergence.chain.power_w),
+    )
+    pages.write(output, content, pages.drawn(content, material, _car(vehicle, IDLE_DRIVES[0]).params))
+    atomic_write(output / "study.json", (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+    say(f"{len(tasks)} runs in {time.perf_counter() - started:.0f} s: {output / 'study.html'}")
+    return content
+
+
+def _call(task: Callable[[], Any]) -> Any:
+    return task()
+
+
+def _car(vehicle: str, idle_drive: str) -> cases.Vehicle:
+    return cases.vehicle_of(vehicle, idle_drive)
+
+
+def _our_policies(vehicle: str, policy: str, say: Callable[[str], None]) -> dict[tuple[str, float], str]:
+    source = PolicySource(policy, say=say)
+    return {
+        (idle_drive, friction): source.find(_car(vehicle, idle_drive), friction)
+        for idle_drive in IDLE_DRIVES
+        for friction in paper.FRICTIONS
+    }
+
+
+def _warming(vehicle: str, cycle: str, ours: Mapping[tuple[str, float], str]) -> list[Case]:
+    idle_drive, friction = next(iter(ours))
+    base = Case(cycle, vehicle, idle_drive, friction, "equal")
+    return [
+        base,
+        replace(base, strategy=STRATEGY, policy=ours[idle_drive, friction]),
+        replace(base, strategy="preview"),
+    ]
+
+
+def _rules(vehicle: str, ours: Iterable[tuple[str, float]], jobs: int) -> dict[tuple[str, float], Rule]:
+    keys = list(ours)
+    wanted = [Case(cases.RULE_CYCLE, vehicle, idle_drive, friction, "rule") for idle_drive, friction in keys]
+    return dict(zip(keys, on_all_cores(cases.fitted_rule, wanted, jobs), strict=True))
+
+
+def _fit_cycles(cycles: Sequence[str]) -> tuple[str, ...]:
+    return tuple(cycle for cycle in battery_fit.CYCLES if cycle in cycles) or (cycles[0],)
+
+
+# --- what is driven -------------------------------------------------------------------------------------------------
+
+
+def _plan(
+    vehicle: str,
+    cycles: Sequence[str],
+    ours: Mapping[tuple[str, float], str],
+    paper_policies: Mapping[str, Mapping[tuple[str, float], str]],
+    rules: Mapping[tuple[str, float], Rule],
+) -> _Plan:
+    plan = _Plan([], [], [], [])
+    by_length = sorted(cycles, key=lambda cycle: -cases.cycle_of(cycle).duration_s)
+    for cycle in by_length:
+        for (idle_drive, friction), policy in ours.items():
+            base = Case(cycle, vehicle, idle_drive, friction, "equal")
+            key = (idle_drive, friction)
+            watched = cycle == _among(WINDOW_CYCLE, cycles) and key == (IDLE_DRIVES[0], WINDOW_FRICTION)
+            keep = _WINDOW_SIGNALS if watched else ()
+            plan.cells.extend(_cell(base, policy, paper_policies[PAPER_GRID][key], rules[key].coefficients, keep))
+            plan.gates.extend(
+                _gates(base, paper_policies[PAPER_GRID][key], paper_policies[PAPER_GRID_WITHOUT][key], keep)
+            )
+    base = Case(_among(FRONTIER_CYCLE, cycles), vehicle, IDLE_DRIVES[0], FRONTIER_FRICTION, "equal")
+    plan.frontier.extend(_frontier(base, ours[IDLE_DRIVES[0], FRONTIER_FRICTION]))
+    for idle_drive in IDLE_DRIVES:
+        for cycle in {_among(name, cycles): None for name in ROBUSTNESS_CYCLES}:
+            base = Case(cycle, vehicle, idle_drive, 0.9, "equal")
+            plan.robustness.extend(_robustness(base, ours))
+    return plan
+
+
+def _among(cycle: str, cycles: Sequence[str]) -> str:
+    return cycle if cycle in cycles else cycles[0]
+
+
+def _all(plan: _Plan) -> list[Case]:
+    return [*plan.cells, *plan.gates, *plan.frontier, *(case for _, case in plan.robustness)]
+
+
+def _cell(base: Case, policy: str, paper_policy: str, rule: tuple[float, ...], keep: tuple[str, ...]) -> list[Case]:
+    """All strategies in one cell of Tables 3 to 5, all under the law's normal settings."""
+    problem = cases.policy_of(policy).problem
+    settings = base.settings
+    rivals = [
+        replace(
+            base,
+            strategy="instantaneous_slip",
+            label=f"{criteria.INSTANTANEOUS_SLIP} {power:g} W",
+            settings=settings._replace(switching_power_w=power),
+        )
+        for power in RIVAL_SWITCHING_W
+    ]
+    return [
+        replace(base, label=criteria.ED, keep=keep),
+        replace(base, strategy="rule", label=criteria.GRDP, rule=rule),
+        replace(
+            base,
+            strategy="sdp",
+            label=pages.PAPER_SDP,
+            policy=paper_policy,
+            settings=settings._replace(decision_period_s=PAPER_PERIOD_S),
+        ),
+        replace(base, strategy=STRATEGY, label=criteria.OURS, policy=policy, keep=keep),
+        replace(base, strategy="instantaneous", label=criteria.INSTANTANEOUS),
+        *rivals,
+        replace(
+            base,
+            strategy="preview",
+            label=criteria.BOUND,
+            switching_cost_j=problem.switching_cost_j,
+            switching_fixed_cost_j=problem.switching_fixed_cost_j,
+        ),
+        replace(base, strategy="preview", label=pages.FREE_BOUND),
+    ]
+
+
+def _gates(base: Case, paper_policy: str, without: str, keep: tuple[str, ...]) -> list[Case]:
+    """Table 6: the paper's SDP without skid avoidance, and with Table 2 as printed."""
+    settings = base.settings._replace(decision_period_s=PAPER_PERIOD_S)
+    return [
+        replace(
+            base,
+            strategy="sdp",
+            label=pages.GATE_OFF,
+            policy=without,
+            settings=settings._replace(gate_mode=GATE_MODES["off"]),
+            keep=keep,
+        ),
+        replace(
+            base,
+            strategy="sdp",
+            label=pages.GATE_TABLE_2,
+            policy=paper_policy,
+            settings=settings._replace(gate_mode=GATE_MODES["table2"], gate_hysteresis=0.0, gate_driving=False),
+            keep=keep,
+        ),
+    ]
+
+
+def _frontier(base: Case, policy: str) -> list[Case]:
+    """Saving against share changes: what the price of a change does, for each strategy that has one."""
+    rival = [
+        replace(
+            base,
+            strategy="instantaneous_slip",
+            label=f"instantaneous_slip|{power:g} W",
+            settings=base.settings._replace(switching_power_w=power),
+        )
+        for power in FRONTIER_POWERS_W
+    ]
+    bound = [
+        replace(base, strategy="preview", label=f"preview|{cost:g} J", switching_fixed_cost_j=cost)
+        for cost in FRONTIER_COSTS_J
+    ]
+    ours = [
+        replace(base, strategy=STRATEGY, label=f"ours|{factor:g} x", policy=policy, switching_price=factor)
+        for factor in FRONTIER_FACTORS
+    ]
+    return [replace(base, label="ED|"), *rival, *bound, *ours]
+
+
+def _robustness(base: Case, ours: Mapping[tuple[str, float], str]) -> list[tuple[str, Case]]:
+    """Cars, roads and sensors that are not what the policy was solved for; each with equal split beside it."""
+    params = cases.vehicle_of(base.vehicle, base.idle_drive).params
+    chassis = params.chassis
+    variants = {"as solved for": base}
+    for factor in (0.8, 1.2):
+        change = Change("chassis", "mass_kg", factor * chassis.mass_kg)
+        variants[f"mass {factor - 1.0:+.0%}"] = replace(base, plant=(change,))
+    for factor in (0.7, 1.3):
+        changes = tuple(
+            Change("chassis", name, factor * getattr(chassis, name))
+            for name in ("drag_coefficient", "rolling_resistance")
+        )
+        variants[f"road load {factor - 1.0:+.0%}"] = replace(base, plant=changes)
+    for true, assumed in ((0.5, 0.9), (0.2, 0.9), (0.9, 0.2)):
+        variants[f"friction {true:g}, assumed {assumed:g}"] = replace(base, friction=true, assumed_friction=assumed)
+    variants["direct-drive hub motor"] = replace(base, plant=HUB_MOTOR)
+    variants["noise 0.1 m/s, 0.3 rad/s"] = replace(base, noise=SensorNoise(0.1, 0.3))
+    made = []
+    for name, case in variants.items():
+        policy = ours[base.idle_drive, case.told_friction]
+        made.append((name, replace(case, label=criteria.ED)))
+        made.append((name, replace(case, strategy=STRATEGY, label=criteria.OURS, policy=policy)))
+    return made
+
+
+def _stops(vehicle: str, ours: Mapping[tuple[str, float], str]) -> list[skid.Stop]:
+    return [
+        skid.Stop(vehicle, IDLE_DRIVES[1], friction, gate_mode, strategy, policy)
+        for friction in paper.FRICTIONS
+        for strategy, policy in (("equal", ""), (STRATEGY, ours[IDLE_DRIVES[1], friction]))
+        for gate_mode in GATE_MODES
+    ]
+
+
+def _all_stops(stops: Sequence[skid.Stop]) -> list[dict[str, Any]]:
+    return [skid.emergency_stop(stop) for stop in stops]
+
+
+# --- what came of it ------------------------------------------------------------------------------------------------
+
+
+def _content(
+    vehicle: str,
+    plan: _Plan,
+    results: Sequence[Result],
+    battery: battery_fit.Fit,
+    stops: Sequence[Mapping[str, Any]],
+    ours: Mapping[tuple[str, float], str],
+    paper_policies: Mapping[str, Mapping[tuple[str, float], str]],
+) -> dict[str, Any]:
+    tables = len(plan.cells) + len(plan.gates)
+    cell_rows = [compact(row) for row in cases.rows(results[:tables])]
+    rows, gate_rows = cell_rows[: len(plan.cells)], cell_rows[len(plan.cells) :]
+    frontier = _frontier_rows(results[tables : tables + len(plan.frontier)])
+    robustness = _robustness_rows([name for name, _ in plan.robustness], results[tables + len(plan.frontier) :])
+    car = _car(vehicle, IDLE_DRIVES[0])
+    driven = {cases.cycle_of(case.cycle).name: cases.cycle_of(case.cycle) for case in plan.cells}
+    printed = [cases.cycle_of(name) for name in paper.CYCLES]
+    settings = default_settings(STRATEGY)
+    checks = criteria.check(rows, stops, settings.slew_down_nmps)
+    return _rounded(
+        {
+            "format": FORMAT,
+            "package_version": __version__,
+            "vehicle": car.name,
+            "vehicle_hashes": {idle_drive: _car(vehicle, idle_drive).hash for idle_drive in IDLE_DRIVES},
+            "cycles": {name: cycle.sha256 for name, cycle in driven.items()},
+            "strategy": STRATEGY,
+            "settings": settings._asdict(),
+            "policies": {
+                "ours": [_identity(key, path) for key, path in ours.items()],
+                **{grid: [_identity(key, path) for key, path in made.items()] for grid, made in paper_policies.items()},
+            },
+            "cells": rows,
+            "gates": gate_rows,
+            "stops": list(stops),
+            "frontier": {"cycle": FRONTIER_CYCLE, "friction": FRONTIER_FRICTION, "rows": frontier},
+            "robustness": robustness,
+            "battery_fit": battery.numbers(),
+            "sensitivity": _sensitivity(vehicle),
+            "paper": paper.consequences(
+                pack_energy_wh(car.params.battery),
+                {cycle.name: cycle.distance_m for cycle in printed},
+                {cycle.name: cycle.distance_m / cycle.duration_s for cycle in printed},
+            ),
+            "criteria": [criterion._asdict() for criterion in checks],
+        }
+    )
+
+
+def compact(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row without what is the same for all rows."""
+    return {name: row[name] for name in _KEPT}
+
+
+def _rounded(value: Any) -> Any:
+    """Plain values with six significant digits: enough for any table, and stable under the last bits."""
+    if isinstance(value, Mapping):
+        return {str(key): _rounded(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_rounded(entry) for entry in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.6g}") if np.isfinite(value) else None
+    return value
+
+
+def _identity(key: tuple[str, float], path: str) -> dict[str, Any]:
+    policy: Policy = cases.policy_of(path)
+    return {
+        "idle_drive": key[0],
+        "friction": key[1],
+        "solved_for_friction": policy.friction,
+        "grid": policy.problem.name,
+        "checksum": policy.checksum,
+        "switching_cost_j": policy.problem.switching_cost_j,
+        "switching_fixed_cost_j": policy.problem.switching_fixed_cost_j,
+    }
+
+
+def _frontier_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+    rows = []
+    for row in cases.rows(results):
+        family, price = row["label"].split("|")
+        rows.append(
+            {
+                "family": family,
+                "price": price,
+                "saving_percent": row["saving_percent"],
+                "share_changes_per_min": row["share_changes_per_min"],
+            }
+        )
+    return rows
+
+
+def _robustness_rows(names: Sequence[str], results: Sequence[Result]) -> list[dict[str, Any]]:
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    for name, row in zip(names, cases.rows(results), strict=True):
+        if row["label"] != criteria.OURS:
+            continue
+        entry = rows.setdefault((name, row["idle_drive"]), {"variant": name, "idle_drive": row["idle_drive"]})
+        entry[row["cycle"]] = row["saving_percent"]
+        entry["trace_held"] = entry.get("trace_held", True) and row["trace_held"]
+        entry["share_changes_per_min"] = max(entry.get("share_changes_per_min", 0.0), row["share_changes_per_min"])
+    return list(rows.values())
+
+
+def _sensitivity(vehicle: str) -> dict[str, Any]:
+    params = _car(vehicle, IDLE_DRIVES[0]).params
+    curves = {
+        "figure_8": sensitivity.figure_8(params),
+        "figure_9": sensitivity.figure_9(params),
+        "figure_10": [curve for _, panel in sensitivity.figure_10(params) for curve in panel],
+    }
+    return {name: {curve.label: sensitivity.best_front_share(curve) for curve in made} for name, made in curves.items()}
+
+
+def _convergence(policy: Policy) -> tuple[FloatArray, FloatArray]:
+    change = np.array([iteration.policy_change for iteration in policy.iterations])
+    bound = np.array([iteration.bound_j for iteration in policy.iterations])
+    return change, bound
+
+
+def _window(results: Sequence[Result]) -> dict[str, dict[str, FloatArray]]:
+    """Series of the watched runs, by label, inside the window (or all of it, where the cycle is shorter)."""
+    made = {}
+    for result in results:
+        if result.series:
+            time_s = result.series["time_s"]
+            inside = (time_s >= WINDOW_S[0]) & (time_s <= WINDOW_S[1])
+            keep = inside if inside.any() else np.ones(time_s.size, dtype=bool)
+            made[result.case.name] = {name: values[keep] for name, values in result.series.items()}
+    return made
+
+
+def _say(line: str) -> None:
+    tqdm.write(line, file=sys.stderr)
+
+
+def _silent(_: str) -> None:
+    pass

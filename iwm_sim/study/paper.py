@@ -1,0 +1,65 @@
+"""What the paper prints, and what follows from its numbers alone."""
+
+from __future__ import annotations
+
+import functools
+import json
+import statistics
+from importlib.resources import files
+from typing import Any
+
+CYCLES = ("ftp75", "hwfet", "nycc", "udds")
+FRICTIONS = (0.9, 0.5, 0.2)
+
+#: Table of each friction.
+TABLES = {0.9: 3, 0.5: 4, 0.2: 5}
+
+
+@functools.cache
+def printed() -> dict[str, Any]:
+    """The paper's tables 3 to 6 as printed."""
+    text = (files("iwm_sim.study") / "assets" / "paper_tables.json").read_text("utf-8")
+    content: dict[str, Any] = json.loads(text)
+    return content
+
+
+def cell(cycle: str, friction: float) -> dict[str, float]:
+    """Printed ΔSoC of ED, GRDP and SDP, and the printed saving, %."""
+    result: dict[str, float] = printed()["delta_soc_percent"][f"{friction:g}"][cycle]
+    return result
+
+
+def consequences(
+    pack_energy_wh: float, distance_m: dict[str, float], mean_speed_mps: dict[str, float]
+) -> dict[str, Any]:
+    """What the printed numbers imply.
+
+    Parameters
+    ----------
+    pack_energy_wh : of the car of Table 1
+    distance_m, mean_speed_mps : of each cycle
+
+    Returns
+    -------
+    `wh_per_km` and `mean_power_w` by cycle (ED, friction 0.9), `savings` with mean and median, whether the savings are
+    what the ΔSoC say (to the digits printed), where GRDP beats ED
+    """
+    cells = {(cycle, friction): cell(cycle, friction) for friction in FRICTIONS for cycle in CYCLES}
+    savings = [values["saving"] for values in cells.values()]
+    usual = [values["saving"] for key, values in cells.items() if key != ("nycc", 0.2)]
+    wh_per_km = {c: cell(c, 0.9)["ED"] / 100.0 * pack_energy_wh / (distance_m[c] / 1000.0) for c in CYCLES}
+    return {
+        "wh_per_km": wh_per_km,
+        "mean_power_w": {c: wh_per_km[c] * 3.6 * mean_speed_mps[c] for c in CYCLES},
+        "mean_saving_percent": statistics.fmean(savings),
+        "mean_saving_without_nycc_on_ice_percent": statistics.fmean(usual),
+        "median_saving_percent": statistics.median(savings),
+        "largest_misprint_percent": max(
+            abs(100.0 * (1.0 - values["SDP"] / values["ED"]) - values["saving"]) for values in cells.values()
+        ),
+        "grdp_beats_ed": sum(values["GRDP"] < values["ED"] for values in cells.values()),
+        "cells": len(cells),
+        "table_6_repeats_table_3": all(
+            printed()["table_6"][c]["with_skid_avoidance"] == cell(c, 0.9)["saving"] for c in CYCLES
+        ),
+    }

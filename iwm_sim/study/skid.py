@@ -1,0 +1,111 @@
+"""Emergency stops: how far the car slides under each kind of skid avoidance, beside the best that friction allows."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from iwm_power_manager.control import law
+from iwm_power_manager.control.types import GATE_MODES, STRATEGIES, default_settings, initial_state
+from iwm_power_manager.model.chassis import GRAVITY_MPS2
+from iwm_power_manager.model.tyre import slip_ratio
+from iwm_power_manager.vehicle import VehicleParams
+from iwm_sim import closed_loop, plant
+from iwm_sim.metrics import CRITICAL_SLIP, MOVING_MPS, longest_s
+from iwm_sim.study import cases
+
+STOP_FROM_MPS = 25.0
+
+#: What the driver asks for, g: more than any road gives.
+DEMAND_G = 1.5
+
+#: The car counts as stopped below this, m/s; and gives up after that, s.
+_STOPPED_MPS = 0.05
+_LONGEST_S = 60.0
+
+
+class Stop(NamedTuple):
+    """An emergency stop to be made; fields as in `cases.Case`."""
+
+    vehicle: str
+    idle_drive: str
+    friction: float
+    gate_mode: str
+    strategy: str
+    policy: str = ""
+    dt_s: float = 0.01
+    from_mps: float = STOP_FROM_MPS
+
+
+def best_stop_m(friction: float, from_mps: float, vehicle: VehicleParams) -> tuple[float, float]:
+    """Shortest stop with all wheels held at one slip, and that slip.
+
+    Written down anew from eq. 1, 3, 4, 6 and 9, without the kernels of the model: at a constant slip s every wheel
+    gives mu(s) of its load, the loads sum up to the weight, so the deceleration is g (mu(s) + c_rr) + k v^2 and the
+    distance its closed integral.
+    """
+    tyre, chassis = vehicle.tyre, vehicle.chassis
+    slip = np.linspace(1e-3, 1.0, 5000)
+    x = tyre.stiffness_factor * slip
+    angle = tyre.shape_factor * np.arctan(x - tyre.curvature_factor * (x - np.arctan(x)))
+    used = friction * tyre.peak_factor * np.sin(angle)
+    steady = GRAVITY_MPS2 * (used + chassis.rolling_resistance)
+    air = 0.5 * chassis.air_density_kgpm3 * chassis.frontal_area_m2 * chassis.drag_coefficient / chassis.mass_kg
+    distance = np.log1p(air * from_mps**2 / steady) / (2.0 * air)
+    best = int(np.argmin(distance))
+    return float(distance[best]), float(slip[best])
+
+
+def emergency_stop(stop: Stop) -> dict[str, Any]:
+    """Make the stop and say what came of it, as a row."""
+    vehicle = cases.vehicle_of(stop.vehicle, stop.idle_drive)
+    params = vehicle.params
+    settings = default_settings(stop.strategy)._replace(gate_mode=GATE_MODES[stop.gate_mode])
+    if stop.gate_mode == "table2":
+        settings = settings._replace(gate_hysteresis=0.0, gate_driving=False)  # as printed
+    table = cases.policy_of(stop.policy).table() if stop.policy else cases.empty_table()
+    road = (stop.friction,) * 4
+    rolling = params.wheel.radius_m
+    car = plant.initial_plant(params, 0.8, stop.from_mps)
+    memory = initial_state()
+    slips, speeds, accelerations = [], [], []
+    steps = 0
+    while car.speed_mps > _STOPPED_MPS and steps * stop.dt_s < _LONGEST_S:
+        floor = params.driver.power_speed_floor_mps
+        demand = -DEMAND_G * params.chassis.mass_kg * GRAVITY_MPS2 * max(car.speed_mps, floor)
+        measurement = closed_loop.measure(
+            car, float(demand), stop.dt_s, stop.friction, 0.0, (0.0, 0.0, 0.0, 0.0), params
+        )
+        command, memory = law.step(measurement, memory, settings, params, table)
+        slips.append(
+            [
+                slip_ratio(car.wheel_speed_radps[wheel], car.speed_mps, rolling, params.tyre.slip_speed_floor_mps)
+                for wheel in (0, 2)
+            ]
+        )
+        speeds.append(car.speed_mps)
+        car = plant.advance(car, command.motor_torque_nm, command.friction_torque_nm, 0.0, road, stop.dt_s, 1, params)
+        accelerations.append(car.acceleration_mps2)
+        steps += 1
+    best_m, best_slip = best_stop_m(stop.friction, stop.from_mps, params)
+    beyond = (np.min(np.array(slips), axis=1) < -CRITICAL_SLIP) & (np.array(speeds) > MOVING_MPS)
+    moving = np.array(speeds) > MOVING_MPS
+    jerk = np.diff(np.array(accelerations)) / stop.dt_s
+    return {
+        "idle_drive": vehicle.idle_drive,
+        "friction": stop.friction,
+        "gate_mode": stop.gate_mode,
+        "strategy": stop.strategy,
+        "strategy_code": STRATEGIES[stop.strategy],
+        "distance_m": float(car.distance_m),
+        "best_m": best_m,
+        "best_slip": -best_slip,
+        "longer_percent": 100.0 * (float(car.distance_m) / best_m - 1.0),
+        "stopped": bool(car.speed_mps <= _STOPPED_MPS),
+        "min_slip": float(np.min(np.array(slips)[moving])) if moving.any() else 0.0,
+        "locked_s": float(np.count_nonzero(beyond) * stop.dt_s),
+        "longest_locked_s": longest_s(beyond, stop.dt_s),
+        "rms_jerk_mps3": float(math.sqrt(np.mean(jerk**2))) if jerk.size else 0.0,
+    }
