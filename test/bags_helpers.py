@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import struct
 from pathlib import Path
@@ -19,7 +20,7 @@ from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.control.supervision import SupervisionLimits
-from iwm_power_manager.control.types import Settings, default_settings
+from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -47,9 +48,11 @@ class ScriptedDrive:
 
     DT_NS = 10_000_000
 
-    def __init__(self, settings: Settings | None = None, strategy: str = "instantaneous_slip") -> None:
+    def __init__(self, strategy: str = "instantaneous_slip") -> None:
         self.vehicle = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"))
-        self.settings = settings or default_settings(strategy)
+        # No price for a change of the share: so that the strategy does something in a second.
+        self.parameters = {"strategy": strategy, "switching_power_w": 0.0}
+        self.settings = default_settings(strategy)._replace(switching_power_w=0.0)
         supervision = SupervisionLimits(0.3, 2.0, 0.5, 0.5)
         limits = ControllerLimits(steps.INPUT_LIMITS._replace(radius_m=0.33), None, supervision)
         self.controller = Controller(self.vehicle.params, WHEEL_NAMES, limits, self.settings, empty_table(), 0.9)
@@ -57,8 +60,8 @@ class ScriptedDrive:
     def inputs(self, i: int) -> tuple[float, list[float], float]:
         """Speed, wheel speeds and demand of step `i`."""
         t = i * 0.01
-        speed = max(0.0, 8.0 * (1.0 - math.cos(0.5 * t)))
-        demand = 9e3 * math.sin(0.5 * t) + 2e3 * math.sin(7.0 * t)
+        speed = 8.0 + 2.0 * math.sin(2.0 * t)
+        demand = 2500.0 * math.sin(5.0 * t) + (0.0, 12e3, 0.0, -9e3)[int(t / 0.3) % 4]
         slip = 0.002 * demand / 1e3
         return speed, [speed / 0.33 * (1.0 + slip * k) for k in (1.0, 1.1, 0.9, 1.0)], demand
 
@@ -66,7 +69,8 @@ class ScriptedDrive:
         """Drive `count` steps from step `start` on, starting the controller anew."""
         wheel_states = JointStateEncoder(WHEEL_NAMES, "velocity")
         torque, numbers = JointStateEncoder(WHEEL_NAMES, "effort"), JointStateEncoder(SIGNAL_NAMES, "position")
-        with BagWriter(path) as bag:
+        custom_data = {"parameters /power_manager": json.dumps(self.parameters)}
+        with BagWriter(path, custom_data=custom_data) as bag:
             speed_topic = bag.add_topic(topic("/vehicle_speed", TWIST))
             wheel_topic = bag.add_topic(topic("/wheel_states", JOINT_STATE))
             battery_topic = bag.add_topic(topic("/battery_state", BATTERY))

@@ -54,6 +54,11 @@ class TopicComparison(NamedTuple):
     only_recorded: int
     only_recomputed: int
 
+    @property
+    def has_record(self) -> bool:
+        """At least one message was recorded."""
+        return self.compared + self.only_recorded > 0
+
 
 class TopicComparer:
     """Pairs messages of one topic by stamp and compares their values, as they come.

@@ -33,6 +33,8 @@ _POWER = {"W": 1.0, "kW": 1e3}
 _RATIO = {"1": 1.0, "%": 0.01}
 _TEMPERATURE = {"degC": 1.0}
 
+_ARTICLES = {"number": "a number", "array": "an array", "message": "a message", "text": "a text", "": "nothing"}
+
 _UNITS: dict[str, dict[str, float]] = {
     "speed": _SPEED,
     "wheel_speed": _ANGULAR_SPEED,
@@ -181,8 +183,8 @@ def _reader(file: Path, key: str, source: Source, topic: Topic, all_wheels: bool
     kind = _field_kind(topic.type, path)
     wanted = "array" if all_wheels else "number"
     if kind != wanted:
-        problem = f"{topic.type} has no field {source.field}" if kind == "" else f"{source.field} is a {kind}"
-        raise ConfigError(file, dotted(key, "field"), problem, f"a field of {topic.type} that is a {wanted}")
+        problem = f"{topic.type} has no field {source.field}" if kind == "" else f"{source.field} is {_ARTICLES[kind]}"
+        raise ConfigError(file, dotted(key, "field"), problem, f"a field of {topic.type} that is {_ARTICLES[wanted]}")
     factor, names = source.factor, source.names
     if names and _field_kind(topic.type, [*path[:-1], "name"]) != "array":
         raise ConfigError(file, dotted(key, "names"), f"{topic.type} has no field `name` beside {source.field}")

@@ -150,7 +150,7 @@ class Replay:
             self._reconstructed.dropped if self._reconstructed else {},
             dict(source.faults) if source else {},
             self._bag.damage,
-            [comparer.result() for comparer in self._comparers.values()],
+            [result for comparer in self._comparers.values() if (result := comparer.result()).has_record],
         )
 
     def _take(self, message: Message) -> list[ReplayedStep]:

@@ -70,7 +70,7 @@ DEFAULT_WAIT_FOR = [
 _MEBIBYTE = 1024 * 1024
 _STATUS_PERIOD_S = 1.0
 _DISCOVERY_FAST_S = 0.05
-_DISCOVERY_SLOW_S = 0.5
+_DISCOVERY_SLOW_S = 0.25
 #: The publisher learns of the match a little after the subscription does.
 _SETTLE_S = 0.2
 #: After the signal to end: taking goes on until nothing has come for the one, at most for the other.

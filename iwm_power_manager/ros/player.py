@@ -36,7 +36,7 @@ _TICK_NS = 10_000_000
 _NS_PER_S = 1_000_000_000
 _DEPTH = 1000
 #: Before the first message: until the listeners have stayed the same for the one, at most for the other.
-_SETTLE_S = 0.5
+_SETTLE_S = 1.0
 _PATIENCE_S = 5.0
 _ACKNOWLEDGE_S = 2.0
 

@@ -251,7 +251,7 @@ def _comparison_lines(report: ReplayReport) -> list[str]:
                 f"recorded {first.recorded!r}, recomputed {first.recomputed!r}"
             )
     if not any(topic.compared for topic in report.comparison):
-        lines.append("  nothing to compare: the bag holds no command of this project")
+        lines.append("  nothing to compare: no recorded command has the stamp of a recomputed one")
     return lines
 
 
