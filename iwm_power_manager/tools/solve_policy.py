@@ -99,7 +99,10 @@ def parser() -> argparse.ArgumentParser:
         "--friction", nargs="+", type=float, metavar="MU", help="peak friction coefficient(s): one policy each"
     )
     problem.add_argument(
-        "--grid", default="fine", metavar="NAME|FILE", help="paper, fine, coupled or a YAML file (default: %(default)s)"
+        "--grid",
+        default="coupled",
+        metavar="NAME|FILE",
+        help="paper, fine, coupled or a YAML file (default: %(default)s)",
     )
     problem.add_argument("--idle-drive", choices=sorted(IDLE_DRIVES), help="replaces the car's idle_drive")
     problem.add_argument("--discount", type=float, metavar="GAMMA", help="replaces the grid's discount")
@@ -343,12 +346,16 @@ def _problem_text(problem: Problem, vehicle: Vehicle) -> str:
         f"(power, speed, slip front, slip rear, previous share), {problem.share.size} controls\n"
         f"step {problem.dt_s:g} s, discount {problem.discount:g} (horizon {horizon:.3g} s), "
         f"alpha {problem.alpha:g}, power error at the {problem.power_error} ({problem.error_norm}), slip "
-        f"{problem.slip_model}, skid avoidance {problem.skid_avoidance}, switching {problem.switching_cost_j:g} J"
+        f"{problem.slip_model}, skid avoidance {problem.skid_avoidance}, switching {problem.switching_cost_j:g} J "
+        f"+ {problem.switching_fixed_cost_j:g} J for any change"
     )
 
 
 def _demand_text(chain: DemandChain, sources: Sequence[Source], dt_s: float) -> str:
-    lines = ["demand from " + ", ".join(f"{s.name} ({s.steps * dt_s:.0f} s x {s.weight:g})" for s in sources)]
+    by_speed = " at each speed" if chain.by_speed.size else ""
+    lines = [
+        f"demand{by_speed} from " + ", ".join(f"{s.name} ({s.steps * dt_s:.0f} s x {s.weight:g})" for s in sources)
+    ]
     lines.append("seconds of data by demand in kW:")
     cells = [
         f"{power / 1000.0:6.4g}: {steps * dt_s:<8.1f}"
