@@ -1,12 +1,7 @@
 """The simulated driver: follows a speed trace with two pedals, and what the pedals ask for.
 
 The driver looks a little ahead, knows the car's mass and road load, and corrects the speed error with a PI controller
-whose integral stops while a pedal is fully pressed. The pedals mean power at the wheels (docs/model.md):
-
-    accelerator a:  P = a * P_max(v),   P_max = min(4 T_peak w, 4 P_motor),  w = v / r
-    brake b:        P = -b * k m g v
-
-both with the speed floor below which a power can no longer be turned into a force (eq. 16 at rest).
+whose integral stops while a pedal is fully pressed. What the pedals mean stands in `iwm_power_manager.model.pedals`.
 """
 
 from __future__ import annotations
@@ -14,7 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, road_load_n
+from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
+from iwm_power_manager.model.pedals import full_braking_w, full_power_w, pedal_power_w
 from iwm_power_manager.vehicle import VehicleParams
 
 #: Below these speeds, m/s, trace and car count as standing; the driver then rests a foot on the brake. Schedules
@@ -36,29 +32,6 @@ class Pedals(NamedTuple):
     accelerator: float
     brake: float
     power_demand_w: float
-
-
-@kernel
-def full_power_w(speed_mps: float, vehicle: VehicleParams) -> float:
-    """Power of the fully pressed accelerator, W."""
-    motor = vehicle.motor
-    wheel_speed = max(speed_mps, vehicle.driver.power_speed_floor_mps) / vehicle.wheel.radius_m
-    return 4.0 * min(motor.peak_torque_nm * wheel_speed, motor.max_power_w)
-
-
-@kernel
-def full_braking_w(speed_mps: float, vehicle: VehicleParams) -> float:
-    """Power of the fully pressed brake pedal, W, positive."""
-    force = vehicle.driver.full_brake_g * vehicle.chassis.mass_kg * GRAVITY_MPS2
-    return force * max(speed_mps, vehicle.driver.power_speed_floor_mps)
-
-
-@kernel
-def pedal_power_w(accelerator: float, brake: float, speed_mps: float, vehicle: VehicleParams) -> float:
-    """Power demand of two pedals, W; the brake overrides the accelerator."""
-    if brake > 0.0:
-        return -brake * full_braking_w(speed_mps, vehicle)
-    return accelerator * full_power_w(speed_mps, vehicle)
 
 
 @kernel
