@@ -433,6 +433,7 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
         driven,
         other,
         cycle=loaded.cycle.name,
+        idle_drive=loaded.vehicle.idle_drive,
         critical_slip=loaded.settings.critical_slip,
         settings=settings,
         remarks=remarks,

@@ -72,6 +72,7 @@ def drive_page(
     reference: Driven,
     *,
     cycle: str,
+    idle_drive: str,
     critical_slip: float,
     settings: Mapping[str, Any],
     remarks: Sequence[str],
@@ -82,6 +83,7 @@ def drive_page(
     ----------
     driven, reference : the drive shown and the one it is compared with
     cycle : name of the cycle
+    idle_drive : the vehicle's, on which the saving depends most
     critical_slip : drawn beside the slips
     settings : what the runs were made with
     remarks : sentences below the table
@@ -90,15 +92,16 @@ def drive_page(
     metrics = driven.metrics
     saving = rows[0]["saving_percent"]
     if driven.strategy == reference.strategy:
-        lead = f"{metrics.distance_m / 1000:.2f} km with equal distribution between the axles."
+        lead = f"{metrics.distance_m / 1000:.2f} km with {driven.strategy} distribution"
     elif saving is None:
-        lead = f"{driven.strategy} and {reference.strategy} did not cover the same distance: compare Wh/km only."
+        lead = f"{driven.strategy} and {reference.strategy} did not cover the same distance: compare Wh/km only"
     else:
         word = "less" if saving >= 0.0 else "more"
         lead = (
             f"{driven.strategy} took {abs(saving):.2f} % {word} energy than {reference.strategy} distribution over the "
-            f"same {metrics.distance_m / 1000:.2f} km."
+            f"same {metrics.distance_m / 1000:.2f} km"
         )
+    lead += f"; idle drive: {idle_drive}."
     held = "the car kept within 2 mph of the cycle's speed, inside 1 s (EPA tolerance)"
     lost = f"the car left the EPA tolerance by up to {metrics.trace_excess_mps:.2f} m/s: its energy may not be compared"
     blocks: list[Block] = [
