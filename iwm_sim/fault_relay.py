@@ -51,6 +51,7 @@ class Delay:
         self._waiting: deque[tuple[float, Any]] = deque()
 
     def __call__(self, message: Any, now_s: float) -> Iterable[Any]:
+        """Messages to send instead."""
         self._waiting.append((now_s + self._delay_s, message))
         while self._waiting and self._waiting[0][0] <= now_s:
             yield self._waiting.popleft()[1]
@@ -64,6 +65,7 @@ class Freeze:
         self._first: Any = None
 
     def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
+        """Messages to send instead."""
         if self._first is None:
             self._first = message
         frozen = copy.deepcopy(self._first)
@@ -79,6 +81,7 @@ class Repeat:
         self._times = times
 
     def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
+        """Messages to send instead."""
         for i in range(self._times):
             again = copy.deepcopy(message)
             if hasattr(again, "header"):
@@ -94,6 +97,7 @@ class Thin:
         self._count = 0
 
     def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
+        """Messages to send instead."""
         self._count += 1
         return (message,) if self._count % self._every == 0 else ()
 
@@ -106,6 +110,7 @@ class Lose:
         self._random = random.Random(seed)
 
     def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
+        """Messages to send instead."""
         return () if self._random.random() < self._probability else (message,)
 
 
@@ -116,6 +121,7 @@ class Restamp:
         self._shift_ns = round(shift_s * _NS_PER_S)
 
     def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
+        """Messages to send instead."""
         field = "clock" if hasattr(message, "clock") else "header"
         if field == "clock":
             message.clock = m.ns_to_stamp(m.stamp_to_ns(message.clock) + self._shift_ns)
@@ -131,6 +137,7 @@ class Replace:
         self._value = value
 
     def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
+        """Messages to send instead."""
         if hasattr(message, "twist"):
             message.twist.linear.x = self._value
         elif hasattr(message, "velocity"):
@@ -149,6 +156,7 @@ class Wheels:
         self._order = order
 
     def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
+        """Messages to send instead."""
         return (
             m.joint_message(
                 m.stamp_to_ns(message.header.stamp),

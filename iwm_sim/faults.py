@@ -8,6 +8,7 @@ after the time docs/safety.md promises, how long recovery took after the fault w
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import os
@@ -19,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -98,9 +100,9 @@ class Result(NamedTuple):
 class Session:
     """Simulator, relay and power manager, and what a case may do to them."""
 
-    def __init__(self, folder: Path, children: Children, relay_node: FaultRelay, sim_time: bool, plan: Plan) -> None:
+    def __init__(self, folder: Path, children: Children, node: FaultRelay, sim_time: bool, plan: Plan) -> None:
         self.folder = folder
-        self.relay = relay_node
+        self.relay: FaultRelay = node
         self.policy = folder / "policies"
         self._children = children
         self._sim_time = sim_time
@@ -203,12 +205,13 @@ class Plan(NamedTuple):
     pattern: str
 
 
+def on(topic: str, make: Callable[[], relay.Transform]) -> Callable[[Session], None]:
+    """What puts a new fault on a topic."""
+    return lambda session: session.spoil(topic, make())
+
+
 def input_cases() -> Iterator[Case]:
     """Every input, broken in every way."""
-
-    def on(topic: str, make: Callable[[], relay.Transform]) -> Callable[[Session], None]:
-        return lambda session: session.spoil(topic, make())
-
     for topic in relay.INPUTS:
         stamped = topic != m.POWER_DEMAND
         slow = topic == m.BATTERY_STATE
@@ -261,7 +264,7 @@ def system_cases() -> Iterator[Case]:
 
         return begin
 
-    brake_s = config.BY_NAME["brake_release_s"].default
+    brake_s = config.DEFAULTS["brake_release_s"]
     yield Case("all inputs stopped", ZERO, every(lambda _: relay.stop))
     yield Case("30 % message loss", LIMITS, every(lambda seed: relay.Lose(0.3, seed)),
                remark="three in a row are lost some three times a second: in and out of degraded")  # fmt: skip
@@ -280,10 +283,9 @@ def system_cases() -> Iterator[Case]:
 def clock_cases() -> Iterator[Case]:
     """What simulated time can do."""
     for shift_s, text in ((5.0, "5 s ahead"), (-5.0, "5 s back")):
-        yield Case(f"clock jumps {text}", ZERO, lambda s, shift=shift_s: s.spoil("clock", relay.Restamp(shift)),
-                   allowed_s=0.1)  # fmt: skip
-    yield Case("clock stops", ZERO, lambda s: s.spoil("clock", relay.stop),
-               allowed_s=float(config.BY_NAME["clock_stopped_s"].default) + 0.1)  # fmt: skip
+        yield Case(f"clock jumps {text}", ZERO, on("clock", partial(relay.Restamp, shift_s)), allowed_s=0.1)
+    yield Case("clock stops", ZERO, on("clock", lambda: relay.stop),
+               allowed_s=float(config.DEFAULTS["clock_stopped_s"]) + 0.1)  # fmt: skip
 
 
 def _restart_simulator(session: Session) -> None:
@@ -298,9 +300,9 @@ def _restart_power_manager(session: Session) -> None:
 
 def promised_s(missed_periods: int) -> float:
     """Time from the last good message to zero motor torque, as docs/safety.md states it, for the slowest input."""
-    period = float(config.BY_NAME["input_period_s.battery_state"].default)
-    step = 1.0 / float(config.BY_NAME["rate_hz"].default)
-    return missed_periods * period + float(config.BY_NAME["fade_s"].default) + 2.0 * step
+    period = float(config.DEFAULTS["input_period_s.battery_state"])
+    step = 1.0 / float(config.DEFAULTS["rate_hz"])
+    return missed_periods * period + float(config.DEFAULTS["fade_s"]) + 2.0 * step
 
 
 def run_case(session: Session, case: Case, plan: Plan) -> Result:
@@ -333,7 +335,7 @@ def run_case(session: Session, case: Case, plan: Plan) -> Result:
     late = [torque for at, torque in torques if at > started + allowed]
     largest = max(late, default=0.0)
     times = [command.time_s for command in commands]
-    gaps = [b - a for a, b in zip(times, times[1:], strict=False)]
+    gaps = [b - a for a, b in itertools.pairwise(times)]
     problems = list(_problems(session, case, commands))
     if case.expect == ZERO and (math.isnan(to_zero_s) or largest > 0.0):
         problems.append(f"torque of {largest:.1f} N m later than {allowed:.2f} s")
@@ -342,13 +344,13 @@ def run_case(session: Session, case: Case, plan: Plan) -> Result:
     if math.isnan(recovery_s):
         problems.append("did not recover")
     said = next((text for text in reports if _tells(text)), "")
-    return Result(case.name, case.expect, to_zero_s, largest, recovery_s, max(gaps, default=math.nan), len(commands), said,
-                  problems)  # fmt: skip
+    gap_s = max(gaps, default=math.nan)
+    return Result(case.name, case.expect, to_zero_s, largest, recovery_s, gap_s, len(commands), said, problems)
 
 
 def _problems(session: Session, case: Case, commands: Sequence[relay.Observation]) -> Iterator[str]:
     """What no command may ever be."""
-    vehicle = load_vehicle(resolve(config.BY_NAME["vehicle_file"].default)).params
+    vehicle = load_vehicle(resolve(config.DEFAULTS["vehicle_file"])).params
     for command in commands:
         torques = command.motor_nm + command.friction_nm
         if not all(map(math.isfinite, torques)):
@@ -414,7 +416,10 @@ def show(result: Result) -> str:
     )
 
 
-HEADER = f"{'fault':38} {'must':14} {'zero, s':>7} {'later Nm':>8} {'back, s':>8} {'gap, s':>6} {'cmds':>5}  result  [reported]"
+HEADER = (
+    f"{'fault':38} {'must':14} {'zero, s':>7} {'later Nm':>8} {'back, s':>8} {'gap, s':>6} {'cmds':>5}  "
+    "result  [reported]"
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -197,6 +197,7 @@ SPECS = (
 )
 
 BY_NAME = {spec.name: spec for spec in SPECS}
+DEFAULTS: dict[str, Any] = {spec.name: spec.default for spec in SPECS}
 
 
 def check_together(values: Mapping[str, Any]) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba.core import config as numba_config
 
 from iwm_power_manager.actuation.limits import car_power_w
 from iwm_power_manager.control import controller as module
@@ -43,6 +44,8 @@ VALUES: dict[str, Any] = {spec.name: spec.default for spec in config.SPECS}
 LIMITS = ControllerLimits(
     config.input_limits(VALUES, RADIUS), config.age_limits_s(VALUES), SupervisionLimits(0.3, 2.0, 0.1, 0.2)
 )
+#: For coverage and mutation the law runs as plain Python.
+EXAMPLES = 60 if numba_config.DISABLE_JIT else max(settings().max_examples, 500)
 STALE_ALL = STALE_SPEED | STALE_WHEELS | STALE_DEMAND | STALE_BATTERY
 
 
@@ -336,7 +339,7 @@ def feed(drive: Drive, message: tuple[Any, ...]) -> None:
             monitor.take_battery(BatteryReading(stamp, message[2], message[3], 237.0, 0.0), now)
 
 
-@settings(max_examples=max(settings().max_examples, 500))
+@settings(max_examples=EXAMPLES)
 @given(sequences, st.sampled_from(["equal", "instantaneous", "instantaneous_slip"]), st.booleans())
 def test_whatever_comes_in_every_command_is_finite_limited_and_slew_limited(sequence, strategy, healthy_first) -> None:
     drive = Drive(strategy=strategy)
@@ -369,6 +372,7 @@ def test_whatever_comes_in_every_command_is_finite_limited_and_slew_limited(sequ
         before = command.motor_torque_nm
 
 
+@settings(max_examples=min(settings().max_examples, EXAMPLES))
 @given(st.floats(3.0, 30.0), st.floats(-20000.0, 20000.0))
 def test_the_torques_sum_to_the_demand_whenever_no_limit_and_no_gate_binds(speed, demand) -> None:
     drive = Drive()
