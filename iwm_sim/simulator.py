@@ -35,6 +35,7 @@ from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.ros import messages as m
 from iwm_power_manager.ros import qos
+from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.parameters import Change, Spec, Value, declare
 from iwm_power_manager.share import resolve
@@ -423,6 +424,8 @@ def main(args: Sequence[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _interrupted)
     try:
+        check_parameter_files(sys.argv if args is None else list(args))
+        check_arguments("simulator", "A driver and a car on a drive cycle, seen through topics.", PARAMETERS, args)
         # rclpy's own handlers would close DDS under a callback that is publishing.
         rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
         node = Simulator()

@@ -34,7 +34,7 @@ from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport
 from iwm_power_manager.ros import diagnostics, messages, qos, realtime
-from iwm_power_manager.ros.arguments import check_parameter_files
+from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
@@ -512,6 +512,7 @@ def main(args: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, on_signal)
     try:
         check_parameter_files(sys.argv if args is None else args)
+        check_arguments("power_manager", "Splits the driver's power demand between four motors.", config.SPECS, args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PowerManager()
     except (IwmError, RuntimeError) as error:

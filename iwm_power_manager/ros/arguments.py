@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 import itertools
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterable, Sequence
+
+from rclpy.utilities import remove_ros_args
 
 from iwm_power_manager.files import read_yaml
+from iwm_power_manager.ros.parameters import ParameterError, Spec
 
 _PARAMS_FILE = "--params-file"
 
@@ -25,3 +30,40 @@ def check_parameter_files(arguments: Sequence[str]) -> None:
     for option, path in itertools.pairwise(arguments):
         if option == _PARAMS_FILE:
             read_yaml(path)
+
+
+def check_arguments(node: str, description: str, specs: Iterable[Spec], args: Sequence[str] | None) -> None:
+    """Show help if it is asked for; refuse what is neither ROS's nor help. Both end the program.
+
+    Parameters
+    ----------
+    node : name of the executable
+    description : what it does, in one sentence
+    specs : its parameters
+    args : the whole command line with the program's name first; None takes the process's own
+
+    Raises
+    ------
+    ParameterError
+        What stands after `--ros-args` is wrong.
+    """
+    try:
+        own = remove_ros_args(sys.argv if args is None else list(args))[1:]
+    except RuntimeError as error:
+        # rcl adds where in its sources that was noticed.
+        raise ParameterError(" ".join(str(error).split(", at ")[0].split())) from None
+    lines = [f"  {spec.name} = {_shown(spec.default)}   [{spec.allowed()}]\n      {spec.description}" for spec in specs]
+    parser = argparse.ArgumentParser(
+        prog=node,
+        usage=f"{node} [-h] [--ros-args --params-file FILE -p PARAMETER:=VALUE -r FROM:=TO ...]",
+        description=description,
+        epilog="parameters, their defaults and what is allowed:\n" + "\n".join(lines),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.parse_args(own)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return '""' if value == "" else str(value)

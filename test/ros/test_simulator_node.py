@@ -21,6 +21,7 @@ from iwm_power_manager.ros import messages as m
 from iwm_power_manager.ros import qos
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
+from iwm_sim import simulator
 from iwm_sim.drive import Drive, load_run
 from iwm_sim.simulator import PARAMETERS
 
@@ -295,6 +296,33 @@ def test_what_it_cannot_work_with_gives_one_line_and_exit_code_1(tmp_path, param
     lines = [line for line in running.text().splitlines() if not line.startswith("[INFO]")]
     assert len(lines) == 1, running.text()
     assert expected in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "expected"),
+    [
+        (["--ros-args", "--params-file", "/nowhere.yaml"], 1, "simulator: /nowhere.yaml: cannot be read"),
+        (["--ros-args", "-p", "friction=0.5"], 1, "simulator: Failed to parse ROS arguments: Couldn't parse parameter"),
+        (["--friction", "0.5"], 2, "simulator: error: unrecognized arguments: --friction 0.5"),
+    ],
+)
+def test_a_wrong_command_line_is_refused_in_one_line(capsys, monkeypatch, args, code, expected) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    try:
+        found = simulator.main(["simulator", *args])
+    except SystemExit as stop:
+        found = stop.code
+    assert found == code
+    assert capsys.readouterr().err.splitlines()[-1].startswith(expected)
+
+
+def test_help_names_every_parameter(capsys, monkeypatch) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    with pytest.raises(SystemExit) as stop:
+        simulator.main(["simulator", "--help"])
+    assert stop.value.code == 0
+    shown = capsys.readouterr().out
+    assert all(f"  {spec.name} = " in shown for spec in PARAMETERS)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
