@@ -24,7 +24,7 @@ from ..control.monitor import (
 )
 from ..control.record import SIGNAL_NAMES, from_numbers
 from ..control.supervision import SupervisionLimits
-from ..control.types import Command, ControllerState, Measurement, Settings, initial_state
+from ..control.types import Command, ControllerState, initial_state
 from ..model.pedals import pedal_power_w
 from ..ros import lockstep
 from .joint_state import NamedValues
@@ -70,7 +70,6 @@ class ReplayedStep(NamedTuple):
     ----------
     stamp_ns : of the command
     log_time_ns, publish_time_ns : of the message that caused the step
-    measurement, settings : what the law took
     command : what it decided
     before, after : its memory
     values : numbers of `control.record.SIGNALS`
@@ -79,8 +78,6 @@ class ReplayedStep(NamedTuple):
     stamp_ns: int
     log_time_ns: int
     publish_time_ns: int
-    measurement: Measurement
-    settings: Settings
     command: Command
     before: ControllerState
     after: ControllerState
@@ -139,8 +136,6 @@ class RecordedSteps:
             recorded.stamp_ns,
             log_time_ns,
             publish_time_ns,
-            measurement,
-            settings,
             command,
             before,
             after,
@@ -315,14 +310,11 @@ class ReconstructedSteps:
         except ControlFaultError as error:
             self.faults[str(error)] += 1
             return []
-        step = from_numbers(dict(zip(SIGNAL_NAMES, numbers, strict=True)))
         return [
             ReplayedStep(
                 stamp_ns,
                 value.log_time_ns,
                 value.publish_time_ns,
-                step.measurement,
-                step.settings,
                 command,
                 before,
                 controller.state,

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from ..control.record import from_numbers
+from ..control.record import SIGNAL_NAMES, from_numbers
 from ..control.types import STRATEGIES, Measurement, Wheels
 from ..model.battery import chemical_power_w
 from ..model.motor import electrical_power_w, idle_drag_nm
@@ -114,7 +114,8 @@ def what_if(
         meter = EnergyMeter(label, plan.vehicle.params)
         for _, steps in Replay(bag, plan, mapping).steps(progress):
             for step in steps:
-                meter.add(step.measurement, step.command.motor_torque_nm, step.command.friction_torque_nm)
+                measurement = from_numbers(dict(zip(SIGNAL_NAMES, step.values, strict=True))).measurement
+                meter.add(measurement, step.command.motor_torque_nm, step.command.friction_torque_nm)
         results.append(meter.result())
     return results
 

@@ -122,7 +122,7 @@ def test_a_topic_without_slash_is_found_in_its_namespace_unless_there_are_two() 
     ],
 )
 def test_a_mistake_in_the_file_is_named(tmp_path: Path, text: str, line: str) -> None:
-    with pytest.raises(ConfigError, match="mapping.yaml") as caught:
+    with pytest.raises(ConfigError, match=r"mapping\.yaml") as caught:
         load_mapping(mapping_file(tmp_path, text))
     assert line in str(caught.value)
     assert "\n" not in str(caught.value)

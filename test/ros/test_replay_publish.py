@@ -65,8 +65,13 @@ def played_to_the_node(
     tmp_path: Path, start: Callable[..., subprocess.Popen[str]], lockstep: bool, strategy: str, inputs: Path
 ) -> Path:
     """Play `inputs` to a real power manager, record what happens; returns that bag."""
-    parameters = [f"lockstep:={str(lockstep).lower()}", f"strategy:={strategy}", "policy_file:=''", "use_sim_time:=true",
-                  "switching_power_w:=0.0"]  # fmt: skip
+    parameters = [
+        f"lockstep:={str(lockstep).lower()}",
+        f"strategy:={strategy}",
+        "policy_file:=''",
+        "use_sim_time:=true",
+        "switching_power_w:=0.0",
+    ]
     manager = start("nodes.power_manager", "--ros-args", *(text for name in parameters for text in ("-p", name)))
     recorder = start(
         "nodes.recorder", "--ros-args", "-p", f"output:={tmp_path / 'recorded'}",

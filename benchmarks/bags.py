@@ -1,0 +1,372 @@
+"""Bags: messages per second written, read, replayed and recorded over DDS, beside other writers and bare reading.
+
+    python benchmarks/bags.py                 all but the recording over DDS
+    python benchmarks/bags.py --dds 10        with 10 s of 5 topics at 1 kHz into a real recorder
+
+Everything is measured in one run, the contenders in turns, the best of several rounds counts: what is left out are
+pauses of the machine, which hit everybody.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from iwm_power_manager.bags.definitions import definition_of, typestore
+from iwm_power_manager.bags.joint_state import JOINT_STATE, JointStateEncoder
+from iwm_power_manager.bags.mapping import load_mapping
+from iwm_power_manager.bags.metadata import Qos, Topic
+from iwm_power_manager.bags.plan import WHEEL_NAMES, Choice, make_plan
+from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.bags.recording import Recording
+from iwm_power_manager.bags.replay import Replay, ReplayOutput
+from iwm_power_manager.bags.writer import BagWriter, WriterOptions
+
+TWIST, FLOAT64 = "geometry_msgs/msg/TwistStamped", "std_msgs/msg/Float64"
+TOPICS = 5
+ROUNDS = 3
+#: Messages the recorder's node hands over at a time: 20 ms of 5 topics at 1 kHz.
+BATCH = 100
+MESSAGES = [
+    JointStateEncoder(WHEEL_NAMES, "effort")(i * 1_000_000, [math.sin(i + k) * 100.0 for k in range(4)])
+    for i in range(1000)
+]
+
+
+def main() -> int:
+    """Run what was asked for and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--messages", type=int, default=200_000, help="to write (default 200000)")
+    parser.add_argument("--steps", type=int, default=6000, help="control steps to replay (default 6000)")
+    parser.add_argument("--dds", type=float, default=0.0, metavar="S", help="seconds of recording over DDS")
+    parser.add_argument("--folder", help="disk to write to (default: a temporary folder)")
+    parser.add_argument("--json", metavar="FILE", help="write the numbers")
+    options = parser.parse_args()
+    numbers: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory(prefix="iwm_bench_", dir=options.folder) as name:
+        folder = Path(name)
+        numbers["write"] = _write(folder, options.messages)
+        numbers["read"] = _read(folder, options.steps)
+        if options.dds:
+            numbers["dds"] = _record_over_dds(folder, options.dds)
+    if options.json:
+        Path(options.json).write_text(json.dumps(numbers, indent=1) + "\n")
+    return 0
+
+
+def _best(contenders: dict[str, Callable[[], int]], reference: str, what: str) -> dict[str, float]:
+    """Rate of each contender in its best round; prints the table."""
+    rates = dict.fromkeys(contenders, 0.0)
+    for _ in range(ROUNDS):
+        for name, run in contenders.items():
+            started = time.perf_counter()
+            count = run()
+            rates[name] = max(rates[name], count / (time.perf_counter() - started))
+    print(f"\n{what:44} {'messages/s':>12} {'ratio':>7}")
+    for name, rate in rates.items():
+        print(f"{name:44} {rate:12.0f} {rate / rates[reference]:7.2f}")
+    return rates
+
+
+# --- writing --------------------------------------------------------------------------------------------------------
+
+
+def _write(folder: Path, count: int) -> dict[str, float]:
+    definition = definition_of(JOINT_STATE)
+    reference = "rosbags, none"
+    contenders: dict[str, Callable[[], int]] = {}
+
+    def fresh(suffix: str = "") -> Path:
+        path = folder / f"bag{suffix}"
+        if path.is_dir():
+            shutil.rmtree(path)
+        path.unlink(missing_ok=True)
+        return path
+
+    def topics(add: Callable[[Topic], int]) -> list[int]:
+        return [add(Topic(f"/topic_{i}", JOINT_STATE, *definition, (Qos(),))) for i in range(TOPICS)]
+
+    def ours(compression: str) -> int:
+        with BagWriter(fresh(), WriterOptions(compression=compression)) as bag:
+            numbers = topics(bag.add_topic)
+            for i in range(count):
+                bag.write(numbers[i % TOPICS], i * 200_000, MESSAGES[i % 1000], i * 200_000, i)
+        return count
+
+    def recorder_path() -> int:
+        """All the recorder's node does with a message it has taken: queue, thread, flush by time, wait for the disk."""
+        recording = Recording(fresh())
+        recording.start()
+        numbers = topics(recording.add_topic)
+        for first in range(0, count, BATCH):
+            recording.put(
+                [
+                    (numbers[i % TOPICS], i * 200_000, MESSAGES[i % 1000], i * 200_000, i)
+                    for i in range(first, first + BATCH)
+                ]
+            )
+            while recording.status().queue_bytes > 32_000_000:
+                time.sleep(0.001)
+        recording.close()
+        if recording.status().written != count:
+            raise RuntimeError(f"wrote {recording.status().written} of {count} messages")
+        return count
+
+    def rosbags(mode: CompressionMode) -> int:
+        writer = Writer(fresh(), version=9, storage_plugin=StoragePlugin.MCAP)
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+        with writer:
+            connections = [
+                writer.add_connection(f"/topic_{i}", JOINT_STATE, typestore=typestore()) for i in range(TOPICS)
+            ]
+            for i in range(count):
+                writer.write(connections[i % TOPICS], i * 200_000, MESSAGES[i % 1000])
+        return count
+
+    contenders[reference] = lambda: rosbags(CompressionMode.NONE)
+    contenders["rosbags, zstd"] = lambda: rosbags(CompressionMode.STORAGE)
+    contenders["mcap (Python), zstd"] = lambda: _mcap_package(fresh(".mcap"), definition[0], count)
+    try:
+        import foxglove  # noqa: F401
+
+        contenders["foxglove-sdk (Rust), zstd, bare .mcap"] = lambda: _foxglove_sdk(
+            fresh(".mcap"), definition[0], count
+        )
+    except ImportError:
+        print("foxglove-sdk is not installed: left out")
+    for compression in ("none", "lz4", "zstd"):
+        contenders[f"BagWriter, {compression}"] = lambda compression=compression: ours(compression)
+    contenders["recorder: queue + thread + sync, zstd"] = recorder_path
+    return _best(contenders, reference, f"write {count} JointStates, {TOPICS} topics")
+
+
+def _mcap_package(path: Path, definition: str, count: int) -> int:
+    from mcap.writer import CompressionType
+    from mcap.writer import Writer as McapWriter
+
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, compression=CompressionType.ZSTD)
+        writer.start("ros2")
+        schema = writer.register_schema(JOINT_STATE, "ros2msg", definition.encode())
+        channels = [writer.register_channel(f"/topic_{i}", "cdr", schema) for i in range(TOPICS)]
+        for i in range(count):
+            writer.add_message(channels[i % TOPICS], i * 200_000, MESSAGES[i % 1000], i * 200_000, i)
+        writer.finish()
+    return count
+
+
+def _foxglove_sdk(path: Path, definition: str, count: int) -> int:
+    import foxglove
+
+    context = foxglove.Context()
+    with foxglove.open_mcap(path, context=context):
+        schema = foxglove.Schema(name=JOINT_STATE, encoding="ros2msg", data=definition.encode())
+        channels = [
+            foxglove.Channel(f"/topic_{i}", schema=schema, message_encoding="cdr", context=context)
+            for i in range(TOPICS)
+        ]
+        for i in range(count):
+            channels[i % TOPICS].log(MESSAGES[i % 1000], log_time=i * 200_000)
+    return count
+
+
+# --- reading and replaying ------------------------------------------------------------------------------------------
+
+
+def _read(folder: Path, steps: int) -> dict[str, float]:
+    inputs, drive = folder / "inputs", folder / "drive"
+    _write_inputs(inputs, steps)
+    mapping = load_mapping()
+    choice = Choice(strategy="instantaneous_slip")
+
+    def replay(path: Path, output: Path | None, wanted: Choice) -> int:
+        count = 0
+        with BagReader(path) as bag:
+            plan = make_plan(wanted, bag.custom_data)
+            run = Replay(bag, plan, mapping)
+            writer = BagWriter(output, WriterOptions(), bag.custom_data) if output else None
+            sink = ReplayOutput(writer, bag, plan) if writer else None
+            for message, made in run.steps():
+                count += 1
+                if sink is not None:
+                    sink.write(message, made)
+            if writer is not None:
+                writer.close()
+            if run.report().steps != steps:
+                raise RuntimeError(f"{run.report().steps} of {steps} steps")
+        return count
+
+    replay(inputs, drive, choice)
+
+    def bare(deserialize: bool) -> int:
+        count = 0
+        with AnyReader([drive]) as reader:
+            for connection, _, data in reader.messages():
+                if deserialize:
+                    reader.deserialize(data, connection.msgtype)
+                count += 1
+        return count
+
+    def ours() -> int:
+        with BagReader(drive) as bag:
+            return sum(1 for _ in bag.messages())
+
+    def again(path: Path) -> int:
+        shutil.rmtree(folder / "again", ignore_errors=True)
+        return replay(path, folder / "again", Choice() if path == drive else choice)
+
+    reference = "AnyReader with deserialisation"
+    return _best(
+        {
+            reference: lambda: bare(True),
+            "AnyReader, raw": lambda: bare(False),
+            "BagReader, raw": ours,
+            "replay with control, compared": lambda: replay(drive, None, Choice()),
+            "replay with control, compared and written": lambda: again(drive),
+            "replay from inputs alone, written": lambda: again(inputs),
+        },
+        reference,
+        f"read a drive of {steps} steps",
+    )
+
+
+def _write_inputs(path: Path, steps: int) -> None:
+    """Inputs of a drive as the simulator publishes them: nothing that is real, everything at its real size."""
+    types = typestore().types
+    stamp_type, header_type = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+    vector, battery_type = types["geometry_msgs/msg/Vector3"], types["sensor_msgs/msg/BatteryState"]
+    wheels = JointStateEncoder(WHEEL_NAMES, "velocity")
+    cells = np.zeros(0, dtype=np.float32)
+    kinds = {
+        "/clock": "rosgraph_msgs/msg/Clock",
+        "/vehicle_speed": TWIST,
+        "/wheel_states": JOINT_STATE,
+        "/battery_state": "sensor_msgs/msg/BatteryState",
+        "/accelerator_pedal": FLOAT64,
+        "/brake_pedal": FLOAT64,
+        "/power_demand": FLOAT64,
+    }
+    with BagWriter(path) as bag:
+        numbers = {name: bag.add_topic(Topic(name, kind, *definition_of(kind))) for name, kind in kinds.items()}
+        for i in range(steps):
+            now = (i + 1) * 20_000_000
+            stamp = stamp_type(now // 10**9, now % 10**9)
+            header = header_type(stamp, "base_link")
+            speed = 8.0 + 5.0 * math.sin(0.1 * i * 0.02)
+            demand = 2500.0 * math.sin(0.02 * i) + (0.0, 9e3, 0.0, -7e3)[i // 100 % 4]
+            twist = types["geometry_msgs/msg/Twist"](vector(speed, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+            battery = battery_type(
+                header_type(stamp, ""),
+                230.0,
+                25.0,
+                -9.0,
+                math.nan,
+                200.0,
+                200.0,
+                0.7,
+                2,
+                0,
+                3,
+                True,
+                cells,
+                cells,
+                "",
+                "",
+            )
+            content = {
+                "/clock": types["rosgraph_msgs/msg/Clock"](stamp),
+                "/vehicle_speed": types[TWIST](header, twist),
+                "/wheel_states": wheels(now, [speed / 0.33] * 4),
+                "/battery_state": battery,
+                "/accelerator_pedal": types[FLOAT64](0.1),
+                "/brake_pedal": types[FLOAT64](0.0),
+                "/power_demand": types[FLOAT64](demand),
+            }
+            for order, (name, message) in enumerate(content.items()):
+                data = message if isinstance(message, bytes) else bytes(typestore().serialize_cdr(message, kinds[name]))
+                bag.write(numbers[name], now + order * 1000, data)
+
+
+# --- over DDS -------------------------------------------------------------------------------------------------------
+
+_PUBLISHER = """
+import sys, time
+import rclpy
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
+rclpy.init()
+node = rclpy.create_node("load")
+publishers = [node.create_publisher(JointState, f"/topic_{i}", QoSProfile(depth=1000)) for i in range(5)]
+message = JointState(name=["front_left", "front_right", "rear_left", "rear_right"], effort=[1.0, 2.0, 3.0, 4.0])
+while any(publisher.get_subscription_count() == 0 for publisher in publishers):
+    time.sleep(0.01)
+time.sleep(0.5)
+rounds = int(1000 * float(sys.argv[1]))
+start = time.monotonic()
+for i in range(rounds):
+    for publisher in publishers:
+        publisher.publish(message)
+    time.sleep(max(0.0, start + (i + 1) * 1e-3 - time.monotonic()))
+took = time.monotonic() - start
+for publisher in publishers:
+    publisher.wait_for_all_acked(Duration(seconds=10))
+print(rounds * 5, took)
+"""
+
+
+def _record_over_dds(folder: Path, seconds: float) -> dict[str, float]:
+    environment = {**os.environ, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(folder)}
+    environment.setdefault("ROS_DOMAIN_ID", "97")
+    arguments = [
+        "-p",
+        f"output:={folder / 'dds'}",
+        "-p",
+        "topics:=['']",
+        "-p",
+        "regex:=/topic_.*",
+        "-p",
+        "wait_for:=['']",
+    ]
+    recorder = subprocess.Popen(
+        [sys.executable, "-m", "iwm_power_manager.nodes.recorder", "--ros-args", *arguments],
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    load = subprocess.run(
+        [sys.executable, "-c", _PUBLISHER, str(seconds)], env=environment, capture_output=True, text=True, check=True
+    )
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    recorder.terminate()
+    _, said = recorder.communicate(timeout=60)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    sent, took = load.stdout.split()
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    with BagReader(folder / "dds") as bag:
+        recorded = sum(1 for _ in bag.messages())
+    lost = re.search(r"dropped (\d+), lost on the way (\d+)", said)
+    print(f"\n5 topics at 1 kHz over DDS for {float(took):.1f} s: {sent} sent, {recorded} recorded, missing "
+          f"{int(sent) - recorded}; the recorder says: {lost[0] if lost else said.strip()}")  # fmt: skip
+    print(f"recorder: {cpu_s:.2f} s of CPU with its start, {100 * cpu_s / float(took):.0f} % of a core")
+    return {"sent": float(sent), "recorded": recorded, "cpu_s": cpu_s, "seconds": float(took)}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
