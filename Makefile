@@ -24,14 +24,14 @@ test: lint type  ## Linters, types and all tests
 .PHONY: policies study bench
 CYCLES := $(foreach cycle,ftp75 hwfet nycc,--cycle config/cycles/$(cycle).csv)
 policies: setup-run  ## Solve the shipped policies again (the same tables come out)
-	@$(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml $(CYCLES) --friction 0.9 0.5 0.2 \
-	  --grid fine --output policies $(ARGS)
+	@for idle in drag none; do $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml --idle-drive $$idle \
+	  $(CYCLES) --friction 0.9 0.5 0.2 --grid coupled --output policies $(ARGS) || exit $$?; done
 
 study: setup-run  ## All tables and figures of the paper, and what beats them
 	@$(BIN)/evaluate --study runs/study $(ARGS)
 
-bench: setup-dev  ## Time solver, closed loop, control path and bags on this machine
-	@$(BIN)/python -m iwm_sim.bench $(ARGS)
+bench: setup-dev  ## Time control path, bags and closed loop on this machine, each beside a peer
+	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit $$?; done
 
 ##@ Safety
 .PHONY: faults soak nightly coverage mutation
