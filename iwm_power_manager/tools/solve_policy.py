@@ -69,8 +69,8 @@ examples:
   Check that a policy file belongs to a car and keeps the bound it claims:
     solve_policy --vehicle my_car.yaml --check my_policy.npz
 
-Vehicles, cycles and grids that come with the package are found by name. On one machine the same inputs give the same file, byte for
-byte. Results go to stdout, progress to stderr.
+Vehicles, cycles and grids that come with the package are found by name. On one machine the same inputs give the same
+file, byte for byte. Results go to stdout, progress to stderr.
 
 exit codes: 0 solved or checked, 1 a policy missed its bound, 2 bad arguments or files, 130 interrupted
 """
