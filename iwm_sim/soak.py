@@ -1,0 +1,244 @@
+"""`python -m iwm_sim.soak`: half an hour in real time at 100 Hz; memory, deadlines and counts.
+
+Simulator, power manager and recorder run as in a car. Meanwhile this process samples the memory of each, and keeps a
+deadline of its own at the same rate with nothing to do: where the power manager is late and this process is late at the
+same moment, it was the machine. At the end the bag has to hold exactly what each topic's publisher says it published.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import sys
+import tempfile
+import threading
+import time
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+
+from iwm_power_manager import files
+from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.errors import IwmError
+from iwm_power_manager.ros import messages as m
+from iwm_sim.demo import environment, node_command
+from iwm_sim.drive import load_run
+from iwm_sim.processes import Child, Children
+
+_RATE_HZ = 100.0
+_PERIOD_S = 1.0 / _RATE_HZ
+_SAMPLE_S = 5.0
+#: Memory is compared from here on: until then caches fill.
+_SETTLED = 0.2
+#: A step is late when it comes this many periods after the previous one.
+_LATE_PERIODS = 1.5
+#: The machine's own lateness counts as the cause when it is this near.
+_NEAR_S = 0.1
+_SIMULATED = (m.VEHICLE_SPEED, m.WHEEL_STATES, m.BATTERY_STATE, m.POWER_DEMAND, m.ACCELERATOR_PEDAL, m.BRAKE_PEDAL)
+
+
+class Witness(threading.Thread):
+    """Keeps a deadline at the control rate and notes when it was missed.
+
+    Attributes
+    ----------
+    late_s : wall-clock times at which this process came too late
+    """
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.late_s: list[float] = []
+        self.stopped = threading.Event()
+
+    def run(self) -> None:
+        """Sleep to each deadline until stopped."""
+        due = time.monotonic()
+        while not self.stopped.is_set():
+            due += _PERIOD_S
+            time.sleep(max(due - time.monotonic(), 0.0))
+            behind = time.monotonic() - due
+            if behind > (_LATE_PERIODS - 1.0) * _PERIOD_S:
+                self.late_s.append(time.time())
+                due += behind
+
+
+class Recorded(NamedTuple):
+    """What the bag holds.
+
+    Attributes
+    ----------
+    counts : messages by topic
+    step_ns : stamps of the power manager's steps
+    skipped : steps whose state is not in the bag
+    uncommanded : steps without one of the two commands
+    degraded : steps in another mode than normal, after the first normal one
+    """
+
+    counts: dict[str, int]
+    step_ns: list[int]
+    skipped: int
+    uncommanded: int
+    degraded: int
+
+
+def read_bag(path: Path) -> Recorded:
+    """Count, and follow the power manager's steps."""
+    counts: Counter[str] = Counter()
+    commands: dict[str, set[int]] = {m.WHEEL_TORQUE_COMMAND: set(), m.FRICTION_BRAKE_COMMAND: set()}
+    step_ns: list[int] = []
+    skipped = degraded = 0
+    previous, normal = -1, False
+    with BagReader(path) as bag:
+        for message in bag.messages():
+            topic = message.topic.lstrip("/")
+            counts[topic] += 1
+            if topic not in commands and topic != m.POWER_MANAGER_STATE:
+                continue
+            content = deserialize_message(message.data, JointState)
+            stamp_ns = m.stamp_to_ns(content.header.stamp)
+            if topic in commands:
+                commands[topic].add(stamp_ns)
+                continue
+            signals = m.read_named_numbers(content)[1]
+            step = int(signals["step"])
+            skipped += step - previous - 1 if previous >= 0 else 0
+            previous = step
+            normal = normal or signals["mode"] == 1
+            degraded += normal and signals["mode"] != 1
+            step_ns.append(stamp_ns)
+    last = step_ns[-1] if step_ns else 0
+    expected = set(step_ns)
+    uncommanded = sum(len(expected - {s for s in stamps if s <= last}) for stamps in commands.values())
+    return Recorded(dict(counts), step_ns, skipped, uncommanded, degraded)
+
+
+def late_steps(step_ns: Sequence[int], machine_late_s: Sequence[float]) -> tuple[int, int]:
+    """Late steps, and how many of them the machine's own lateness does not explain."""
+    own = total = 0
+    for before, after in itertools.pairwise(step_ns):
+        if after - before <= _LATE_PERIODS * _PERIOD_S * 1e9:
+            continue
+        total += 1
+        index = bisect_left(machine_late_s, before / 1e9 - _NEAR_S)
+        if index == len(machine_late_s) or machine_late_s[index] > after / 1e9 + _NEAR_S:
+            own += 1
+    return total, own
+
+
+def resident_kb(child: Child) -> int:
+    """Resident memory of a process, kB; 0 once it has ended."""
+    try:
+        lines = Path(f"/proc/{child.process.pid}/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith("VmRSS:")), 0)
+
+
+def growth_percent(samples_kb: Sequence[int]) -> float:
+    """Growth from the median of the first settled fifth to that of the last, %."""
+    settled = [sample for sample in samples_kb[int(len(samples_kb) * _SETTLED) :] if sample]
+    fifth = max(len(settled) // 5, 1)
+    first, last = np.median(settled[:fifth]), np.median(settled[-fifth:])
+    return float(100.0 * (last / first - 1.0))
+
+
+def drive(minutes: float, folder: Path) -> tuple[dict[str, list[int]], Witness, Recorded, Mapping[str, int]]:
+    """Drive for some minutes; memory samples by process, the witness, the bag, and what the simulator published."""
+    cycle = folder / "soak.csv"
+    # Up and down between 5 and 15 m/s: drive and brake all the time.
+    turns = int(minutes * 2) + 2
+    rows = [f"{30.0 * i:.1f},{5.0 if i % 2 else 15.0}" for i in range(1, 2 * turns)]
+    files.atomic_write(cycle, ("time_s,speed_mps\n0.0,0.0\n" + "\n".join(rows) + "\n").encode())
+    witness = Witness()
+    memory: dict[str, list[int]] = {}
+    with Children(environment(folder), folder) as children:
+        bag, result = folder / "bag", folder / "drive.npz"
+        recorder = children.start("recorder", node_command("recorder", {"output": str(bag)}))
+        manager = children.start(
+            "power manager",
+            node_command(
+                "power_manager", {"strategy": "equal", "policy_file": "", "input_period_s.battery_state": _PERIOD_S}
+            ),
+        )
+        simulator = children.start(
+            "simulator",
+            node_command(
+                "simulator",
+                {
+                    "cycle_file": str(cycle),
+                    "until_s": 60.0 * minutes,
+                    "rate_hz": _RATE_HZ,
+                    "wait_for_recorder": True,
+                    "partner_timeout_s": 300.0,
+                    "result_file": str(result),
+                },
+            ),
+        )
+        witness.start()
+        watched = {"recorder": recorder, "power manager": manager, "simulator": simulator}
+        while simulator.running:
+            for name, child in watched.items():
+                memory.setdefault(name, []).append(resident_kb(child))
+            for child in (recorder, manager):
+                child.check_running()
+            time.sleep(_SAMPLE_S)
+        simulator.check()
+        manager.interrupt()
+        recorder.interrupt(60.0)
+        witness.stopped.set()
+    notes = load_run(result)[1]
+    return memory, witness, read_bag(bag), notes["published"]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the soak; exit code 1 if anything grew, was lost, or was late by itself."""
+    parser = argparse.ArgumentParser(prog="soak", description=__doc__)
+    parser.add_argument("--minutes", type=float, default=30.0, help="how long (30)")
+    parser.add_argument("--growth", type=float, default=5.0, help="growth of memory that passes, %% (5)")
+    parser.add_argument("--json", type=Path, help="write the numbers there too")
+    chosen = parser.parse_args(arguments)
+    try:
+        with tempfile.TemporaryDirectory(prefix="iwm-soak-") as folder:
+            memory, witness, recorded, published = drive(chosen.minutes, Path(folder))
+    except IwmError as error:
+        print(f"soak: {error}", file=sys.stderr)
+        return 1
+    problems = []
+    growth = {name: growth_percent(samples) for name, samples in memory.items()}
+    for name, percent in growth.items():
+        print(f"memory of the {name:14} {memory[name][-1] / 1024:7.1f} MB, growth {percent:+.1f} %")
+        if percent > chosen.growth:
+            problems.append(f"the {name} grew by {percent:.1f} %")
+    late, own = late_steps(recorded.step_ns, witness.late_s)
+    steps = len(recorded.step_ns)
+    print(f"{steps} steps; {late} late, {own} of them when the machine was not; it was {len(witness.late_s)} times")
+    print(f"{recorded.degraded} steps in another mode than normal")
+    if own:
+        problems.append(f"{own} late steps that the machine does not explain")
+    for topic in _SIMULATED:
+        count = recorded.counts.get(topic, 0)
+        print(f"{topic:22} published {published.get(topic, 0):7}, recorded {count:7}")
+        if count != published.get(topic, 0):
+            problems.append(f"{topic}: {published.get(topic, 0)} published, {count} recorded")
+    for topic in (m.WHEEL_TORQUE_COMMAND, m.FRICTION_BRAKE_COMMAND, m.POWER_MANAGER_STATE):
+        print(f"{topic:22} recorded {recorded.counts.get(topic, 0):7}")
+    if recorded.skipped or recorded.uncommanded:
+        problems.append(
+            f"{recorded.skipped} steps without a state, {recorded.uncommanded} without a command in the bag"
+        )
+    print("; ".join(problems) or "nothing grew, nothing was lost, nothing was late by itself")
+    if chosen.json:
+        numbers = {"growth_percent": growth, "steps": steps, "late": late, "late_by_itself": own, "problems": problems}
+        files.atomic_write(chosen.json, json.dumps(numbers, indent=1).encode())
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
