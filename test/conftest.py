@@ -10,12 +10,21 @@ from pathlib import Path
 from typing import IO
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 
 settings.register_profile("default", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("nightly", settings.get_profile("default"), max_examples=20_000)
+# A mutation run wants the first counterexample at once, not the smallest one.
+settings.register_profile(
+    "mutation",
+    settings.get_profile("default"),
+    max_examples=200,
+    derandomize=True,
+    database=None,
+    phases=(Phase.explicit, Phase.generate),
+)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 

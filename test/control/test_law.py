@@ -6,7 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from iwm_power_manager.control import law
@@ -20,8 +20,8 @@ from oracles.physics import regeneration_limit, torque_limit
 from oracles.splits import rule
 from oracles.step import G, electrical_w, friction_coefficient
 
-#: At least 500 in every run, 20,000 in the nightly profile.
-EXAMPLES = max(500, settings().max_examples)
+#: At least 500 in every run, 20,000 in the nightly profile; a mutation run keeps to its own number.
+EXAMPLES = max(500, settings().max_examples) if Phase.shrink in settings().phases else settings().max_examples
 
 CARS = {name: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), name).params
         for name in ("none", "drag", "enabled")}

@@ -138,6 +138,10 @@ def test_every_strategy_is_behind_its_name():
     assert set(t.STRATEGIES) == {"equal", "rule", "instantaneous", "instantaneous_slip", "sdp", "sdp_lookahead", "preview"}
 
 
+def test_a_strategy_the_law_does_not_know_is_equal_split():
+    assert decide(5000.0, 12.0, 0.0, 0.0, 0.3, 0.9, 0, default_settings()._replace(strategy=99), CAR, TABLE) == 0.5
+
+
 def test_the_preview_plays_its_schedule_and_holds_the_last_entry():
     assert [choose("preview", decisions=k) for k in range(5)] == [0.1, 0.9, 0.4, 0.4, 0.4]
     assert choose("preview", power=0.0, decisions=1) == 0.9
