@@ -29,7 +29,7 @@ ARGUMENTS = (
     ("friction", "0.9", "Peak friction coefficient of the road, and what the power manager assumes."),
     ("rate_hz", "100.0", "Rate of simulator and power manager."),
     ("lockstep", "false", "One step at a time, as fast as the nodes answer, instead of real time."),
-    ("strategy", "sdp", "Strategy of the power manager."),
+    ("strategy", "sdp_lookahead", "Strategy of the power manager."),
     ("policy_file", "policies", "Policy file, or folder with a bank of them."),
     ("record", "false", "Also run the recorder, which writes to `bag`."),
     ("bag", "", "Folder of the bag to create; empty: named by date and time, in the working directory."),

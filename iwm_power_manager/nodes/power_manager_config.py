@@ -42,7 +42,7 @@ SPECS = (
     Spec("policy_file", "policies", "Policy file, or folder with a bank of policies over friction; '' for none."),
     Spec(
         "strategy",
-        "sdp",
+        "sdp_lookahead",
         "Strategy that splits the demand between the axles.",
         choices=_NAMED_STRATEGIES,
         change=Change.ALWAYS,
