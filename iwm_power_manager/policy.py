@@ -454,8 +454,13 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
         raise PolicyError(f"{path}: its metadata is incomplete: {error!r}") from None
 
 
-def load_policy_bank(path: Path | str) -> list[Policy]:
+def load_policy_bank(path: Path | str, vehicle: Vehicle | None = None) -> list[Policy]:
     """All policies of a folder (`*.npz`), or the one in a file, by rising friction.
+
+    Parameters
+    ----------
+    vehicle : the car they have to be for: of a folder, policies for other cars do not count (each is verified all the
+        same); a file has to fit. None takes them as they are, all for one car.
 
     Raises
     ------
@@ -466,20 +471,28 @@ def load_policy_bank(path: Path | str) -> list[Policy]:
     files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
     if not files:
         raise PolicyError(f"{path}: holds no policy file (*.npz)")
+    loaded = [(file, load_policy(file)) for file in files]
+    if vehicle is not None:
+        if not path.is_dir():
+            loaded[0][1].check_vehicle(vehicle, str(path))
+        loaded = [(file, policy) for file, policy in loaded if policy.vehicle_hash == vehicle.hash]
+        if not loaded:
+            raise PolicyError(
+                f"{path}: holds no policy for '{vehicle.name}' ({vehicle.hash}, idle_drive {vehicle.idle_drive}); "
+                "solve one for this car with solve_policy"
+            )
+    first_file, first = loaded[0]
     by_friction: dict[float, Path] = {}
-    bank: list[Policy] = []
-    for file in files:
-        policy = load_policy(file)
+    for file, policy in loaded:
         if policy.friction in by_friction:
             raise PolicyError(f"{file}: is for friction {policy.friction:g}, as is {by_friction[policy.friction].name}")
         by_friction[policy.friction] = file
-        if bank and policy.vehicle_hash != bank[0].vehicle_hash:
+        if policy.vehicle_hash != first.vehicle_hash:
             raise PolicyError(
-                f"{file}: was solved for '{policy.vehicle_name}' ({policy.vehicle_hash}), {files[0].name} for "
-                f"'{bank[0].vehicle_name}' ({bank[0].vehicle_hash}): a folder holds one car's policies"
+                f"{file}: was solved for '{policy.vehicle_name}' ({policy.vehicle_hash}), {first_file.name} for "
+                f"'{first.vehicle_name}' ({first.vehicle_hash}): a bank holds one car's policies"
             )
-        bank.append(policy)
-    return sorted(bank, key=lambda policy: policy.friction)
+    return sorted((policy for _, policy in loaded), key=lambda policy: policy.friction)
 
 
 def choose(bank: Sequence[Policy], friction: float) -> Policy:

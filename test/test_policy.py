@@ -7,6 +7,7 @@ import io
 import itertools
 import json
 import zipfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -326,8 +327,21 @@ def test_a_bank_is_for_one_car(policy, tmp_path):
     save_policy(policy, tmp_path / "a.npz")
     other = dataclasses.replace(policy, friction=0.7, vehicle_hash="0" * 16, checksum="")
     save_policy(other, tmp_path / "b.npz")
-    with pytest.raises(PolicyError, match="a folder holds one car's policies"):
+    with pytest.raises(PolicyError, match="a bank holds one car's policies"):
         load_policy_bank(tmp_path)
+
+
+def test_of_a_folder_for_several_cars_a_car_gets_its_own(policy, tmp_path):
+    save_policy(policy, tmp_path / "a.npz")
+    other = dataclasses.replace(policy, vehicle_hash="0" * 16, checksum="")
+    save_policy(other, tmp_path / "b.npz")
+    car = SimpleNamespace(name="car", hash=policy.vehicle_hash, idle_drive="drag")
+    assert [found.vehicle_hash for found in load_policy_bank(tmp_path, car)] == [policy.vehicle_hash]
+    with pytest.raises(PolicyError, match=r"b\.npz: was solved for"):
+        load_policy_bank(tmp_path / "b.npz", car)
+    car.hash = "1" * 16
+    with pytest.raises(PolicyError, match=r"holds no policy for 'car' \(1{16}, idle_drive drag\)"):
+        load_policy_bank(tmp_path, car)
 
 
 def test_an_empty_bank_and_an_impossible_friction_are_refused(policy, tmp_path):

@@ -93,11 +93,7 @@ class PolicyBank:
         if self._bank is None:
             if not self._path:
                 raise PolicyError("the strategy needs a policy; name one with --policy")
-            path = resolve(self._path)
-            bank = load_policy_bank(path)
-            for policy in bank:
-                policy.check_vehicle(self._vehicle, str(path))
-            self._bank = bank
+            self._bank = load_policy_bank(resolve(self._path), self._vehicle)
         return self._bank
 
 

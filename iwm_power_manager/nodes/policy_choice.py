@@ -115,9 +115,7 @@ def _load(path: str, vehicle: Vehicle) -> tuple[list[Policy], dict[Path, int]]:
     if not path:
         raise PolicyError("policy_file: is empty; allowed: a policy file, or a folder of them")
     resolved = resolve(path)
-    bank = load_policy_bank(resolved)
-    for policy in bank:
-        policy.check_vehicle(vehicle, str(resolved))
+    bank = load_policy_bank(resolved, vehicle)
     files = sorted(resolved.glob("*.npz")) if resolved.is_dir() else [resolved]
     return bank, {file: _modified_ns(file) for file in files}
 
