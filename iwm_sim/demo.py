@@ -114,7 +114,9 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
     parser.add_argument("--cycle", default="config/cycles/nycc.csv", help="drive cycle, CSV")
     parser.add_argument("--vehicle", default="config/vehicles/jalalmaab_2015.yaml", help="vehicle, YAML")
     parser.add_argument("--policy", default="policies", help="policy file, or folder with a bank of them")
-    parser.add_argument("--strategy", default="sdp_lookahead", choices=names, help="how the power manager splits the demand")
+    parser.add_argument(
+        "--strategy", default="sdp_lookahead", choices=names, help="how the power manager splits the demand"
+    )
     parser.add_argument("--friction", default=0.9, type=_number(0.05, 1.5), help="peak friction coefficient")
     parser.add_argument(
         "--idle-drive", default="", choices=["", *IDLE_DRIVES], help="replaces the vehicle's idle_drive; '': as it is"

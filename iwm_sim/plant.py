@@ -154,7 +154,6 @@ def advance(
     """
     battery = vehicle.battery
     motor = vehicle.motor
-    inertia = vehicle.wheel.inertia_kgm2
     radius = vehicle.wheel.radius_m
     m0 = obeyed_torque_nm(motor_command_nm[0], state.wheel_speed_radps[0], state.speed_mps, state.heat[0], vehicle)
     m1 = obeyed_torque_nm(motor_command_nm[1], state.wheel_speed_radps[1], state.speed_mps, state.heat[1], vehicle)

@@ -1,8 +1,9 @@
 """Deterministic dynamic programming over a whole cycle known in advance.
 
 The bound nobody can beat: the split that costs least battery energy plus switching cost when every future demand is
-known. It takes demand and speed from a drive of the cycle with equal split (the driver asks for almost the same whatever
-the split does) and lets slip settle; the schedule it finds is then driven in the closed loop like any other strategy. The generalized rule (the paper's GRDP) is a straight line fitted to its P_f over P_dem.
+known. It takes demand and speed from a drive of the cycle with equal split (the driver asks for almost the same
+whatever the split does) and lets slip settle; the schedule it finds is then driven in the closed loop like any other
+strategy. The generalized rule (the paper's GRDP) is a straight line fitted to its P_f over P_dem.
 """
 
 from __future__ import annotations
