@@ -254,5 +254,6 @@ def test_killed_at_random_moments_a_recording_loses_less_than_its_last_second(tm
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(1800)
 def test_killed_fifty_times_a_recording_loses_less_than_its_last_second(tmp_path: Path) -> None:
     kill_campaign(tmp_path, runs=54, at_once=3)

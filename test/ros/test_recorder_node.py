@@ -435,6 +435,7 @@ def test_killed_at_1_khz_the_node_loses_less_than_its_last_second(
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(1800)
 def test_killed_fifty_times_at_1_khz_the_node_loses_less_than_its_last_second(
     tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
 ) -> None:
