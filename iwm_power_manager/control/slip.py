@@ -33,7 +33,9 @@ def filtered(previous: float, value: float, dt_s: float, time_constant_s: float)
 
 
 @kernel
-def road_torque_nm(applied_nm: float, speed_before_radps: float, speed_radps: float, dt_s: float, inertia: float) -> float:
+def road_torque_nm(
+    applied_nm: float, speed_before_radps: float, speed_radps: float, dt_s: float, inertia: float
+) -> float:
     """Torque the road took from a wheel over the last step (eq. 11 solved for r F)."""
     return applied_nm - inertia * (speed_radps - speed_before_radps) / dt_s
 

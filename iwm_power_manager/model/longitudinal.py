@@ -145,6 +145,9 @@ def step(
         and resisting_torque_nm[2] == resisting_torque_nm[3]
         and friction[2] == friction[3]
     )
+    before = wheel_speed_radps
+    driving = motor_torque_nm
+    resisting = resisting_torque_nm
     after = max(speed_mps + acceleration_mps2 * dt_s, 0.0)
     w0, f0, b0 = 0.0, 0.0, 0.0
     w1, f1, b1 = 0.0, 0.0, 0.0
@@ -160,22 +163,14 @@ def step(
     last_change = math.inf
     for _ in range(60):
         front, rear = normal_forces_n((after - speed_mps) / dt_s, after, grade, chassis)
-        w0, f0, b0 = wheel_step(
-            wheel_speed_radps[0], after, motor_torque_nm[0], resisting_torque_nm[0], front, friction[0], dt_s, wheel, tyre
-        )
+        w0, f0, b0 = wheel_step(before[0], after, driving[0], resisting[0], front, friction[0], dt_s, wheel, tyre)
         w1, f1, b1 = w0, f0, b0
         if not mirrored_front:
-            w1, f1, b1 = wheel_step(
-                wheel_speed_radps[1], after, motor_torque_nm[1], resisting_torque_nm[1], front, friction[1], dt_s, wheel, tyre
-            )
-        w2, f2, b2 = wheel_step(
-            wheel_speed_radps[2], after, motor_torque_nm[2], resisting_torque_nm[2], rear, friction[2], dt_s, wheel, tyre
-        )
+            w1, f1, b1 = wheel_step(before[1], after, driving[1], resisting[1], front, friction[1], dt_s, wheel, tyre)
+        w2, f2, b2 = wheel_step(before[2], after, driving[2], resisting[2], rear, friction[2], dt_s, wheel, tyre)
         w3, f3, b3 = w2, f2, b2
         if not mirrored_rear:
-            w3, f3, b3 = wheel_step(
-                wheel_speed_radps[3], after, motor_torque_nm[3], resisting_torque_nm[3], rear, friction[3], dt_s, wheel, tyre
-            )
+            w3, f3, b3 = wheel_step(before[3], after, driving[3], resisting[3], rear, friction[3], dt_s, wheel, tyre)
         drag = aerodynamic_force_n(after, chassis)
         coasting = speed_mps + dt_s / mass * (f0 + f1 + f2 + f3 - drag - grade_force)
         moved = max(coasting - rolling_drop, 0.0)

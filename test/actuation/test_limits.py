@@ -15,7 +15,10 @@ from iwm_power_manager.vehicle import load_vehicle
 from oracles.control_law import battery_factor
 from oracles.step import electrical_w
 
-CARS = [load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), drive).params for drive in ("none", "drag", "enabled")]
+CARS = [
+    load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), drive).params
+    for drive in ("none", "drag", "enabled")
+]
 BATTERY = CARS[0].battery
 TORQUE = st.one_of(st.just(0.0), st.floats(0.1, 200.0), st.floats(-80.0, -0.1))
 SPEED = st.floats(0.0, 120.0)
@@ -30,8 +33,16 @@ def test_a_fade_is_a_clamped_line_either_way_round(value, zero, full):
 
 @pytest.mark.parametrize(
     ("soc", "discharge", "charge"),
-    [(0.0, 0.0, 1.0), (0.02, 0.0, 1.0), (0.06, 0.5, 1.0), (0.1, 1.0, 1.0), (0.5, 1.0, 1.0), (0.95, 1.0, 1.0),
-     (0.975, 1.0, 0.5), (1.0, 1.0, 0.0)],
+    [
+        (0.0, 0.0, 1.0),
+        (0.02, 0.0, 1.0),
+        (0.06, 0.5, 1.0),
+        (0.1, 1.0, 1.0),
+        (0.5, 1.0, 1.0),
+        (0.95, 1.0, 1.0),
+        (0.975, 1.0, 0.5),
+        (1.0, 1.0, 0.0),
+    ],
 )
 def test_charge_derates_each_limit_at_its_own_end(soc, discharge, charge):
     limits = battery_limits_w(soc, 25.0, BATTERY)
@@ -40,8 +51,16 @@ def test_charge_derates_each_limit_at_its_own_end(soc, discharge, charge):
 
 @pytest.mark.parametrize(
     ("degc", "discharge", "charge"),
-    [(-20.0, 1.0, 0.0), (0.0, 1.0, 0.0), (5.0, 1.0, 0.5), (10.0, 1.0, 1.0), (45.0, 1.0, 1.0), (52.5, 0.5, 0.5),
-     (60.0, 0.0, 0.0), (math.nan, 1.0, 1.0)],
+    [
+        (-20.0, 1.0, 0.0),
+        (0.0, 1.0, 0.0),
+        (5.0, 1.0, 0.5),
+        (10.0, 1.0, 1.0),
+        (45.0, 1.0, 1.0),
+        (52.5, 0.5, 0.5),
+        (60.0, 0.0, 0.0),
+        (math.nan, 1.0, 1.0),
+    ],
 )
 def test_cold_stops_charging_and_heat_stops_both(degc, discharge, charge):
     limits = battery_limits_w(0.5, degc, BATTERY)
@@ -62,7 +81,9 @@ def test_the_car_takes_what_its_four_motors_take(front, rear, front_speed, rear_
 
 
 @given(TORQUE, TORQUE, SPEED, SPEED, st.floats(1.0, 47500.0), st.floats(1.0, 47500.0), st.sampled_from(CARS))
-def test_the_scale_is_the_largest_factor_inside_the_limits(front, rear, front_speed, rear_speed, discharge, charge, car):
+def test_the_scale_is_the_largest_factor_inside_the_limits(
+    front, rear, front_speed, rear_speed, discharge, charge, car
+):
     factor, _ = battery_factor((front, rear), (front_speed, rear_speed), discharge, charge, car.motor)
     assume(not math.isnan(factor))
     ours = battery_scale(front, rear, front_speed, rear_speed, discharge, charge, car.motor)

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control import law
 from iwm_power_manager.control import types as t
-from iwm_power_manager.control.types import Command, ControllerState, Measurement, Settings, default_settings, initial_state
+from iwm_power_manager.control.types import (
+    Command,
+    ControllerState,
+    Measurement,
+    Settings,
+    default_settings,
+    initial_state,
+)
 from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -23,8 +30,10 @@ from oracles.step import G, electrical_w, friction_coefficient
 #: At least 500 in every run, 20,000 in the nightly profile; a mutation run keeps to its own number.
 EXAMPLES = max(500, settings().max_examples) if Phase.shrink in settings().phases else settings().max_examples
 
-CARS = {name: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), name).params
-        for name in ("none", "drag", "enabled")}
+CARS = {
+    name: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), name).params
+    for name in ("none", "drag", "enabled")
+}
 CAR = CARS["drag"]
 RADIUS = CAR.wheel.radius_m
 TABLE = empty_table(rule=(300.0, 0.4, -200.0, 0.7), schedule=(0.5, 0.0, 1.0, 0.3, 0.85, 1.0))
@@ -128,9 +137,7 @@ def measurements(draw, dt=STEPS):
     for _ in range(2):
         wheel = speed / RADIUS * (1.0 + draw(SLIPS)) if draw(st.booleans()) else draw(WHEELS)
         wheels += [wheel, wheel + spread]
-    return Measurement(
-        speed, tuple(wheels), draw(DEMANDS), draw(dt), 0.9, draw(POWER_LIMITS), draw(POWER_LIMITS), 0.8
-    )
+    return Measurement(speed, tuple(wheels), draw(DEMANDS), draw(dt), 0.9, draw(POWER_LIMITS), draw(POWER_LIMITS), 0.8)
 
 
 TUNINGS = st.builds(
@@ -250,7 +257,9 @@ def torque_falls_no_faster_than_its_rate_but_by_a_gate_or_a_limit(case):
 
 
 def without_gate_and_limit_the_torques_sum_to_the_demand(case):
-    assert case.delivered_w() == pytest.approx(case.command.front_power_w + case.command.rear_power_w, abs=1e-6, rel=1e-9)
+    assert case.delivered_w() == pytest.approx(
+        case.command.front_power_w + case.command.rear_power_w, abs=1e-6, rel=1e-9
+    )
     if case.command.gate == t.GATE_NONE and case.command.limits == 0:
         assert case.delivered_w() == pytest.approx(case.m.power_demand_w, rel=1e-9, abs=POWER_SLACK_W)
 
@@ -401,7 +410,7 @@ def test_all_of_it_holds_from_the_first_step_on_for_any_sequence_of_measurements
         state = case.after
 
 
-# --- Table 2 as printed -----------------------------------------------------------------------------------------------
+# --- Table 2 as printed ----------------------------------------------------------------------------------------------
 
 TABLE2 = DEFAULT._replace(gate_mode=t.GATE_MODE_TABLE2, gate_hysteresis=0.0, gate_driving=False)
 
@@ -462,7 +471,7 @@ def test_a_gate_cuts_at_once_and_the_way_back_is_slew_limited():
     assert freed.command.motor_torque_nm[0] == pytest.approx(-10.0)
 
 
-# --- Limits, one by one ------------------------------------------------------------------------------------------------
+# --- Limits, one by one ----------------------------------------------------------------------------------------------
 
 
 def test_equal_split_at_ease_gives_each_motor_a_quarter():

@@ -32,7 +32,9 @@ def test_of_two_equally_bad_wheels_the_right_one_counts():
 
 @given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(0.001, 0.1), st.sampled_from([0.0, 0.02, 1.0]))
 def test_the_filter_is_an_implicit_first_order_lag(before, value, dt, constant):
-    assert filtered(before, value, dt, constant) == pytest.approx(oracle.low_pass(before, value, dt, constant), abs=1e-12)
+    assert filtered(before, value, dt, constant) == pytest.approx(
+        oracle.low_pass(before, value, dt, constant), abs=1e-12
+    )
 
 
 def test_a_filter_covers_63_percent_of_a_step_in_its_time_constant():
@@ -57,7 +59,13 @@ SETTINGS = st.builds(
 VEHICLE = SimpleNamespace(wheel=SimpleNamespace(radius_m=RADIUS, inertia_kgm2=INERTIA))
 
 
-@given(st.booleans(), st.floats(-500.0, 500.0), st.floats(-20.0, 200.0), st.one_of(st.floats(0.0, 3.0), st.floats(0.0, 60.0)), SETTINGS)
+@given(
+    st.booleans(),
+    st.floats(-500.0, 500.0),
+    st.floats(-20.0, 200.0),
+    st.one_of(st.floats(0.0, 3.0), st.floats(0.0, 60.0)),
+    SETTINGS,
+)
 def test_the_room_is_the_road_s_torque_and_what_turns_the_wheel_to_its_target(braking, road, wheel, speed, s):
     room = torque_room_nm(
         braking, road, wheel, speed, s.slip_target, s.slip_limiter_s, s.slip_speed_floor_mps, RADIUS, INERTIA
@@ -77,4 +85,6 @@ def test_brakes_can_always_hold_a_car_at_rest():
 
 def test_a_car_at_rest_can_start():
     # 0.3 m/s of slip speed within 0.03 s.
-    assert torque_room_nm(False, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == pytest.approx(0.3 / RADIUS * INERTIA / 0.03)
+    assert torque_room_nm(False, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == pytest.approx(
+        0.3 / RADIUS * INERTIA / 0.03
+    )

@@ -33,8 +33,12 @@ def _solved(previous=(0.0, 0.5, 1.0)):
     }
     shape = tuple(map(len, axes.values()))
     return empty_table(SHARES, rule=(500.0, 0.3, -100.0, 0.8), schedule=(0.1, 0.9, 0.4))._replace(
-        **axes, front_share=rng.uniform(0.0, 1.0, shape), expected_cost_j=rng.uniform(0.0, 300.0, shape),
-        discount=0.95, switching_cost_j=20.0, switching_fixed_cost_j=5.0,
+        **axes,
+        front_share=rng.uniform(0.0, 1.0, shape),
+        expected_cost_j=rng.uniform(0.0, 300.0, shape),
+        discount=0.95,
+        switching_cost_j=20.0,
+        switching_fixed_cost_j=5.0,
     )
 
 
@@ -58,7 +62,15 @@ def test_the_rule_is_one_line_for_driving_and_one_for_braking(power):
 
 
 @settings(max_examples=60)
-@given(POWER, SPEED, SHARE, st.sampled_from([0.9, 0.2]), st.booleans(), st.sampled_from([0.0, 100.0]), st.sampled_from(CARS))
+@given(
+    POWER,
+    SPEED,
+    SHARE,
+    st.sampled_from([0.9, 0.2]),
+    st.booleans(),
+    st.sampled_from([0.0, 100.0]),
+    st.sampled_from(CARS),
+)
 def test_the_cheapest_share_is_the_cheapest_of_all(power, speed, previous, friction, slip_aware, switching, car):
     ours = cheapest_share(power, speed, previous, friction, slip_aware, switching, car, TABLE)
     _, costs = splits.cheapest(power, speed, previous, friction, slip_aware, switching, car, SHARES)
@@ -68,7 +80,9 @@ def test_the_cheapest_share_is_the_cheapest_of_all(power, speed, previous, frict
 
 def test_a_change_has_to_save_the_switching_power():
     def shares(switching):
-        return [cheapest_share(float(p), 12.0, 0.5, 0.9, True, switching, CARS[0], TABLE) for p in range(500, 8000, 500)]
+        return [
+            cheapest_share(float(p), 12.0, 0.5, 0.9, True, switching, CARS[0], TABLE) for p in range(500, 8000, 500)
+        ]
 
     assert set(shares(1e5)) == {0.5}
     assert len(set(shares(0.0))) > 1
@@ -78,7 +92,11 @@ def test_a_change_has_to_save_the_switching_power():
 def test_at_equal_cost_the_share_stays():
     # No loss, no drag: whatever the split, the power is the same.
     motor = CARS[0].motor._replace(
-        loss_constant_w=0.0, loss_linear_speed=0.0, loss_quadratic_speed=0.0, loss_linear_torque=0.0, loss_quadratic_torque=0.0
+        loss_constant_w=0.0,
+        loss_linear_speed=0.0,
+        loss_quadratic_speed=0.0,
+        loss_linear_torque=0.0,
+        loss_quadratic_torque=0.0,
     )
     assert cheapest_share(4000.0, 12.0, 0.37, 0.9, False, 0.0, CARS[0]._replace(motor=motor), TABLE) == 0.37
 
@@ -135,7 +153,15 @@ def test_every_strategy_is_behind_its_name():
     assert choose("instantaneous_slip", 1500.0) == cheapest_share(1500.0, 12.0, 0.3, 0.9, True, 100.0, CAR, TABLE)
     assert choose("sdp") == table_share(5000.0, 12.0, 0.01, -0.02, 0.3, TABLE)
     assert choose("sdp_lookahead") == lookahead_share(5000.0, 12.0, 0.01, -0.02, 0.3, CAR, TABLE)
-    assert set(t.STRATEGIES) == {"equal", "rule", "instantaneous", "instantaneous_slip", "sdp", "sdp_lookahead", "preview"}
+    assert set(t.STRATEGIES) == {
+        "equal",
+        "rule",
+        "instantaneous",
+        "instantaneous_slip",
+        "sdp",
+        "sdp_lookahead",
+        "preview",
+    }
 
 
 def test_a_strategy_the_law_does_not_know_is_equal_split():

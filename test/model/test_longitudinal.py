@@ -65,8 +65,13 @@ FRICTIONS = st.tuples(*[st.sampled_from([0.9, 0.5, 0.2])] * 4)
 
 
 @given(
-    st.one_of(st.just(0.0), st.floats(0.0, 3.0), st.floats(0.0, 45.0)), SLIPS, TORQUES, BRAKES,
-    st.sampled_from([0.0, 0.06, -0.06]), FRICTIONS, st.sampled_from([0.001, 0.002, 0.005]),
+    st.one_of(st.just(0.0), st.floats(0.0, 3.0), st.floats(0.0, 45.0)),
+    SLIPS,
+    TORQUES,
+    BRAKES,
+    st.sampled_from([0.0, 0.06, -0.06]),
+    FRICTIONS,
+    st.sampled_from([0.001, 0.002, 0.005]),
 )
 def test_any_step_solves_the_equations_of_car_and_wheels(speed, slips, motors, brakes, grade, friction, dt):
     wheels = tuple(wheel_speed_at_slip(s, speed, RADIUS) for s in slips)
@@ -118,7 +123,9 @@ def test_a_rolling_car_slows_down_by_its_road_load():
 def test_locked_wheels_stop_the_car_within_v_squared_over_two_mu_g(friction):
     car = CAR._replace(chassis=CAR.chassis._replace(drag_coefficient=0.0, rolling_resistance=0.0))
     sliding = abs(friction_coefficient(-1.0, friction, CAR.tyre))
-    speed, _, distance, _ = drive(25.0, 25.0 / (sliding * G) + 2.0, 0.01, brake=four(900.0), friction=four(friction), car=car, wheels=NOTHING)
+    speed, _, distance, _ = drive(
+        25.0, 25.0 / (sliding * G) + 2.0, 0.01, brake=four(900.0), friction=four(friction), car=car, wheels=NOTHING
+    )
     assert speed < 1e-9
     # Below the floor speed the tyre gives way; that is the last 0.5 m/s.
     assert distance == pytest.approx(25.0**2 / (2.0 * sliding * G), rel=0.005)

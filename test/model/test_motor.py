@@ -35,7 +35,9 @@ def efficiency(wheel, torque):
     return torque * wheel / model.electrical_power_w(torque, wheel, MOTOR)
 
 
-@pytest.mark.parametrize(("wheel", "torque", "known"), [(8.7, 80, 0.516), (30, 80, 0.779), (60, 40, 0.878), (90, 80, 0.897)])
+@pytest.mark.parametrize(
+    ("wheel", "torque", "known"), [(8.7, 80, 0.516), (30, 80, 0.779), (60, 40, 0.878), (90, 80, 0.897)]
+)
 def test_the_check_points_of_the_fit_come_out(wheel, torque, known):
     assert efficiency(float(wheel), float(torque)) == pytest.approx(known, abs=0.0006)
 
@@ -58,9 +60,9 @@ def test_regenerating_loses_what_driving_loses(torque, wheel):
     loss = model.enabled_loss_w(torque, wheel, MOTOR)
     assert loss == model.enabled_loss_w(-torque, wheel, MOTOR)
     assert loss == pytest.approx(loss_w(torque, wheel, MOTOR))
-    assert model.electrical_power_w(torque, wheel, MOTOR) + model.electrical_power_w(-torque, wheel, MOTOR) == pytest.approx(
-        2.0 * loss, abs=1e-9
-    )
+    assert model.electrical_power_w(torque, wheel, MOTOR) + model.electrical_power_w(
+        -torque, wheel, MOTOR
+    ) == pytest.approx(2.0 * loss, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,22 @@ from iwm_power_manager.vehicle import load_vehicle
 from oracles.physics import axle_w
 from oracles.splits import split_w
 
-CARS = {name: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), name).params for name in ("none", "drag", "enabled")}
+CARS = {
+    name: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), name).params
+    for name in ("none", "drag", "enabled")
+}
 CAR = CARS["drag"]
 FORCE = st.one_of(st.sampled_from([0.0, 10.0, -10.0, 1000.0, -8000.0]), st.floats(-8000.0, 4000.0))
 SHARE = st.one_of(st.sampled_from([0.0, 0.5, 1.0]), st.floats(0.01, 0.99))
 
 
-@given(st.floats(-3000.0, 1500.0), st.floats(1.0, 40.0), st.floats(500.0, 3000.0), st.sampled_from([0.9, 0.2]), st.booleans())
+@given(
+    st.floats(-3000.0, 1500.0),
+    st.floats(1.0, 40.0),
+    st.floats(500.0, 3000.0),
+    st.sampled_from([0.9, 0.2]),
+    st.booleans(),
+)
 def test_an_axle_takes_the_power_of_its_two_motors_at_the_settled_slip(force, speed, normal, friction, slip_aware):
     ours = axle_power_w(force, speed, normal, friction, slip_aware, CAR)
     assert ours == pytest.approx(axle_w(force, speed, normal, friction, slip_aware, CAR), rel=1e-5, abs=1e-3)
@@ -28,8 +37,17 @@ def test_an_axle_in_the_air_slips_no_further_than_rolling():
     assert axle_power_w(100.0, 10.0, 0.0, 0.9, True, CAR) == axle_power_w(100.0, 10.0, 1e9, 0.9, False, CAR)
 
 
-@given(FORCE, st.floats(1.0, 40.0), SHARE, st.sampled_from([0.9, 0.5, 0.2]), st.booleans(), st.sampled_from(list(CARS.values())))
-def test_a_split_costs_what_its_axles_cost_and_what_nobody_can_give_is_said(force, speed, share, friction, slip_aware, car):
+@given(
+    FORCE,
+    st.floats(1.0, 40.0),
+    SHARE,
+    st.sampled_from([0.9, 0.5, 0.2]),
+    st.booleans(),
+    st.sampled_from(list(CARS.values())),
+)
+def test_a_split_costs_what_its_axles_cost_and_what_nobody_can_give_is_said(
+    force, speed, share, friction, slip_aware, car
+):
     power, missing = split_power_w(force, speed, share, friction, slip_aware, car)
     known, known_missing = split_w(force, speed, share, friction, slip_aware, car)
     assert power == pytest.approx(known, rel=1e-5, abs=1e-2)
@@ -46,7 +64,9 @@ def test_slip_costs_power():
 def test_what_one_axle_cannot_give_goes_to_the_other():
     # One axle's motors give 2 * 200 N m / 0.33 m = 1212 N.
     assert split_power_w(2000.0, 5.0, 1.0, 0.9, False, CAR)[1] == 0.0
-    assert split_power_w(3000.0, 5.0, 1.0, 0.9, False, CAR)[1] == pytest.approx(3000.0 + 2.0 * (0.69 + 0.0151 * 5.0 / 0.33) / 0.33 - 2424.24, abs=0.01)
+    assert split_power_w(3000.0, 5.0, 1.0, 0.9, False, CAR)[1] == pytest.approx(
+        3000.0 + 2.0 * (0.69 + 0.0151 * 5.0 / 0.33) / 0.33 - 2424.24, abs=0.01
+    )
 
 
 def test_a_demand_stands_for_a_force_at_no_less_than_the_floor_speed():

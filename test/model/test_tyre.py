@@ -25,8 +25,16 @@ def test_slip_follows_eq_10_by_the_sign_of_the_slip_speed(wheel, speed):
 
 @pytest.mark.parametrize(
     ("wheel", "speed", "slip"),
-    [(0.0, 10.0, -1.0), (10.0, 0.0, 1.0), (20.0, 10.0, 0.5), (5.0, 10.0, -0.5), (10.0, 10.0, 0.0), (0.0, 0.0, 0.0),
-     (0.25, 0.0, 0.5), (0.0, 0.25, -0.5)],
+    [
+        (0.0, 10.0, -1.0),
+        (10.0, 0.0, 1.0),
+        (20.0, 10.0, 0.5),
+        (5.0, 10.0, -0.5),
+        (10.0, 10.0, 0.0),
+        (0.0, 0.0, 0.0),
+        (0.25, 0.0, 0.5),
+        (0.0, 0.25, -0.5),
+    ],
 )
 def test_slip_by_hand_standstill_included(wheel, speed, slip):
     assert model.slip_ratio(wheel, speed, 1.0, 0.5) == pytest.approx(slip)

@@ -109,13 +109,18 @@ class Axle:
 
 
 def step(m, state, settings, vehicle, decide):
-    """Motor and friction torque of front and rear wheels, gates, limit bits, slips, shares; `decide` is the strategy."""
+    """Both axles, applied and decided share, limit bits; `decide` is the strategy, called with the two slips."""
     motor, brake, radius = vehicle.motor, vehicle.friction_brake, vehicle.wheel.radius_m
     wheels = m.wheel_speed_radps
     first = state.steps == 0
     axles = [
-        Axle(pair, *(getattr(state, f"{name}_{what}") for what in
-                     ("motor_nm", "total_nm", "speed_radps", "road_nm", "slip", "gated", "heat")))
+        Axle(
+            pair,
+            *(
+                getattr(state, f"{name}_{what}")
+                for what in ("motor_nm", "total_nm", "speed_radps", "road_nm", "slip", "gated", "heat")
+            ),
+        )
         for name, pair in (("front", wheels[:2]), ("rear", wheels[2:]))
     ]
     braking = m.power_demand_w < 0.0
@@ -181,8 +186,12 @@ def step(m, state, settings, vehicle, decide):
         else:
             strongest = min(strongest, axle.grip)
         way = slewed(
-            axle.motor_before, wanted, m.dt_s,
-            settings.slew_up_nmps, settings.slew_down_nmps, settings.slew_regeneration_nmps,
+            axle.motor_before,
+            wanted,
+            m.dt_s,
+            settings.slew_up_nmps,
+            settings.slew_down_nmps,
+            settings.slew_regeneration_nmps,
         )
         axle.motor = 0.0 if axle.gated else min(max(way, -weakest), strongest)
         if abs(axle.motor) <= NOTHING:

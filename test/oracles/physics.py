@@ -116,9 +116,7 @@ def dynamics(speed, wheels, motors, resisting, grade, friction, seconds, vehicle
             front, rear = normal_forces(acceleration, v, grade, car)
             forces = [front * mu[0], front * mu[1], rear * mu[2], rear * mu[3]]
             acceleration = (sum(forces) - road_load(v, grade, car)) / car.mass_kg
-        turning = [
-            (motors[i] - resisting[i] - wheel.radius_m * forces[i]) / wheel.inertia_kgm2 for i in range(4)
-        ]
+        turning = [(motors[i] - resisting[i] - wheel.radius_m * forces[i]) / wheel.inertia_kgm2 for i in range(4)]
         return [acceleration, *turning]
 
     solution = solve_ivp(rates, (0.0, seconds), [speed, *wheels], method="LSODA", rtol=1e-9, atol=1e-9)

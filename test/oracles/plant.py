@@ -14,8 +14,11 @@ def open_circuit_v(soc, battery):
 def ohmic_ohm(soc, battery):
     """Constant above 30 %, the given factor at 10 %, on a line below."""
     return battery.ohmic_resistance_ohm * float(
-        np.interp(soc, [-1.0, 0.1, 0.3], [1.0 + (battery.ohmic_factor_at_10_percent - 1.0) * 6.5,
-                                          battery.ohmic_factor_at_10_percent, 1.0])
+        np.interp(
+            soc,
+            [-1.0, 0.1, 0.3],
+            [1.0 + (battery.ohmic_factor_at_10_percent - 1.0) * 6.5, battery.ohmic_factor_at_10_percent, 1.0],
+        )
     )
 
 

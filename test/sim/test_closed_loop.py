@@ -79,7 +79,13 @@ def test_stepping_the_kernels_from_python_gives_the_bits_of_the_compiled_loop():
         at = [float(x[k]) for x in trace]
         pedals, foot = drive(foot, car.speed_mps, *at, dt, params)
         measurement = closed_loop.measure(
-            car, pedals.power_demand_w, dt, 0.4, float(noise.speed_mps[k]), tuple(map(float, noise.wheel_radps[k])), params
+            car,
+            pedals.power_demand_w,
+            dt,
+            0.4,
+            float(noise.speed_mps[k]),
+            tuple(map(float, noise.wheel_radps[k])),
+            params,
         )
         command, state = law.step(measurement, state, settings, params, TABLE)
         row = dict(zip(COLUMNS, compiled.series[k], strict=True))
@@ -136,7 +142,9 @@ def stop(friction, gate_mode):
         demand = -1.5 * full_braking_w(car.speed_mps, params)
         measurement = closed_loop.measure(car, demand, dt, friction, 0.0, (0.0,) * 4, params)
         command, state = law.step(measurement, state, settings, params, TABLE)
-        car = plant.advance(car, command.motor_torque_nm, command.friction_torque_nm, 0.0, (friction,) * 4, dt, 1, params)
+        car = plant.advance(
+            car, command.motor_torque_nm, command.friction_torque_nm, 0.0, (friction,) * 4, dt, 1, params
+        )
         if car.speed_mps > 1.0:
             slips.append([slip_ratio(w, car.speed_mps, params.wheel.radius_m, 0.5) for w in car.wheel_speed_radps[1:3]])
     return car.distance_m, np.array(slips)

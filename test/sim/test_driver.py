@@ -16,7 +16,15 @@ CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), "none").pa
 SPEED = st.one_of(st.sampled_from([0.0, 0.1, 0.2, 0.3]), st.floats(0.0, 40.0))
 
 
-@given(st.floats(-20.0, 20.0), SPEED, SPEED, SPEED, st.floats(-8.0, 5.0), st.sampled_from([0.0, 0.1, -0.1]), st.sampled_from([0.01, 0.1]))
+@given(
+    st.floats(-20.0, 20.0),
+    SPEED,
+    SPEED,
+    SPEED,
+    st.floats(-8.0, 5.0),
+    st.sampled_from([0.0, 0.1, -0.1]),
+    st.sampled_from([0.01, 0.1]),
+)
 def test_the_pedals_are_those_of_the_plain_driver(integral, speed, trace, ahead, slope, grade, dt):
     pedals, after = drive(DriverState(integral), speed, trace, ahead, slope, grade, dt, CAR)
     accelerator, brake, demand, integral_after = look(integral, speed, trace, ahead, slope, grade, dt, CAR)

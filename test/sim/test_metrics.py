@@ -19,7 +19,7 @@ SPEEDS = st.lists(st.floats(0.0, 30.0), min_size=1, max_size=40)
 
 
 def excess_slowly(trace, speed, dt):
-    """40 CFR 1066.425: for each instant, between the lowest and the highest trace point within a second, 2 mph wider."""
+    """40 CFR 1066.425: between the lowest and the highest trace point within a second, 2 mph wider."""
     reach, worst = round(1.0 / dt), 0.0
     for k, v in enumerate(speed):
         near = trace[max(k - reach, 0) : k + reach + 1]
@@ -108,8 +108,15 @@ def test_slip_counts_while_the_car_moves():
 def test_drivability():
     share = np.array([0.5, 1.0, 1.0, 0.0, 0.0, 0.0])
     found = measure(
-        made(6, decided_share=share, acceleration_mps2=[0.0, 0.1, 0.0, 0.1, 0.0, 0.1], front_motor_nm=[0, 5, 5, 5, 5, 5],
-             rear_motor_nm=[0, 0, -20, 0, 0, 0]), CAR)
+        made(
+            6,
+            decided_share=share,
+            acceleration_mps2=[0.0, 0.1, 0.0, 0.1, 0.0, 0.1],
+            front_motor_nm=[0, 5, 5, 5, 5, 5],
+            rear_motor_nm=[0, 0, -20, 0, 0, 0],
+        ),
+        CAR,
+    )
     assert found.share_changes_per_min == pytest.approx(2 / (0.6 / 60))
     assert found.rms_jerk_mps3 == pytest.approx(1.0)
     assert found.max_torque_rate_nmps == pytest.approx(200.0)

@@ -15,7 +15,10 @@ from iwm_sim.plant import advance, initial_plant, obeyed_torque_nm, ohmic_resist
 from oracles import physics
 from oracles import plant as oracle
 
-CARS = {name: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), name).params for name in ("none", "drag", "enabled")}
+CARS = {
+    name: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), name).params
+    for name in ("none", "drag", "enabled")
+}
 CAR = CARS["none"]
 RADIUS = CAR.wheel.radius_m
 NOTHING = (0.0, 0.0, 0.0, 0.0)
@@ -36,7 +39,7 @@ def hold(state, seconds, dt=0.01, motor=NOTHING, brake=NOTHING, grade=0.0, road=
     return state
 
 
-# --- Battery --------------------------------------------------------------------------------------------------------------
+# --- Battery ---------------------------------------------------------------------------------------------------------
 
 
 @given(st.floats(-0.1, 1.1))
@@ -47,7 +50,9 @@ def test_open_circuit_voltage_and_resistance_follow_the_charge(soc):
 
 def test_resistance_at_its_named_points():
     ohm = CAR.battery.ohmic_resistance_ohm
-    assert [ohmic_resistance_ohm(x, CAR.battery) / ohm for x in (1.0, 0.3, 0.2, 0.1)] == pytest.approx([1.0, 1.0, 1.2, 1.4])
+    assert [ohmic_resistance_ohm(x, CAR.battery) / ohm for x in (1.0, 0.3, 0.2, 0.1)] == pytest.approx(
+        [1.0, 1.0, 1.2, 1.4]
+    )
 
 
 @pytest.mark.parametrize("seconds", [0.1, 16.0, 120.0])
@@ -79,7 +84,7 @@ def test_a_pack_without_polarisation_is_a_source_behind_a_resistance():
     assert oracle.imbalance_j(initial_plant(car, 0.8), state, car) == pytest.approx(0.0, abs=1e-6)
 
 
-# --- Motors and brakes ------------------------------------------------------------------------------------------------
+# --- Motors and brakes -----------------------------------------------------------------------------------------------
 
 
 @given(st.floats(-300.0, 300.0), st.floats(0.0, 150.0), st.floats(0.0, 40.0), st.floats(0.0, 1.2))
@@ -106,8 +111,12 @@ def test_a_hot_motor_derates_to_its_continuous_torque():
 def test_brakes_only_brake_and_no_harder_than_they_can():
     start = initial_plant(CAR, 0.8, 20.0)
     assert advance(start, NOTHING, four(50.0), 0.0, DRY, 0.01, 1, CAR).friction_torque_nm == NOTHING
-    assert advance(start, NOTHING, four(-5000.0), 0.0, DRY, 0.001, 1, CAR).friction_torque_nm == pytest.approx(four(-900.0))
-    assert advance(start, NOTHING, four(-100.0), 0.0, DRY, 0.01, 1, CAR).friction_torque_nm == pytest.approx(four(-100.0))
+    assert advance(start, NOTHING, four(-5000.0), 0.0, DRY, 0.001, 1, CAR).friction_torque_nm == pytest.approx(
+        four(-900.0)
+    )
+    assert advance(start, NOTHING, four(-100.0), 0.0, DRY, 0.01, 1, CAR).friction_torque_nm == pytest.approx(
+        four(-100.0)
+    )
 
 
 def test_idle_drives_drag_and_draw_what_they_are_set_to():
@@ -118,7 +127,9 @@ def test_idle_drives_drag_and_draw_what_they_are_set_to():
     assert slowed["none"].electrical_power_w == 0.0
     assert slowed["drag"].electrical_power_w == pytest.approx(40.0)
     rolling = slowed["drag"].distance_m / RADIUS
-    assert slowed["drag"].energies.idle_drag_j == pytest.approx(4.0 * rolling * (0.69 + 0.0151 * rolling / 10.0), rel=0.01)
+    assert slowed["drag"].energies.idle_drag_j == pytest.approx(
+        4.0 * rolling * (0.69 + 0.0151 * rolling / 10.0), rel=0.01
+    )
 
 
 def test_what_brake_and_drag_take_from_a_wheel_that_stops_is_shared_as_told():
@@ -126,7 +137,7 @@ def test_what_brake_and_drag_take_from_a_wheel_that_stops_is_shared_as_told():
     assert state.energies.friction_brake_j > 20.0 * state.energies.idle_drag_j > 0.0
 
 
-# --- Motion -------------------------------------------------------------------------------------------------------------
+# --- Motion ----------------------------------------------------------------------------------------------------------
 
 
 def test_it_moves_as_scipy_says():
@@ -155,7 +166,7 @@ def test_a_car_starts_rested_and_rolling():
     assert sum(state.energies) == 0.0
 
 
-# --- Books --------------------------------------------------------------------------------------------------------------
+# --- Books -----------------------------------------------------------------------------------------------------------
 
 
 @settings(max_examples=50)
@@ -163,10 +174,12 @@ def test_a_car_starts_rested_and_rolling():
     speed=st.floats(0.0, 30.0),
     commands=st.lists(
         st.tuples(
-            st.tuples(*[st.floats(-100.0, 200.0)] * 4), st.tuples(*[st.sampled_from([0.0, -50.0, -400.0])] * 4),
+            st.tuples(*[st.floats(-100.0, 200.0)] * 4),
+            st.tuples(*[st.sampled_from([0.0, -50.0, -400.0])] * 4),
             st.sampled_from([0.0, 0.05, -0.05]),
         ),
-        min_size=1, max_size=8,
+        min_size=1,
+        max_size=8,
     ),
     road=st.tuples(*[st.sampled_from([0.9, 0.2])] * 4),
     dt=st.sampled_from([0.002, 0.01, 0.05]),

@@ -25,7 +25,13 @@ def path_cost(path, cost, share, switching, fixed):
 
 
 @settings(max_examples=60)
-@given(st.integers(0, 10_000), st.integers(1, 5), st.integers(1, 4), st.sampled_from([0.0, 1.0, 30.0]), st.sampled_from([0.0, 2.0]))
+@given(
+    st.integers(0, 10_000),
+    st.integers(1, 5),
+    st.integers(1, 4),
+    st.sampled_from([0.0, 1.0, 30.0]),
+    st.sampled_from([0.0, 2.0]),
+)
 def test_no_path_is_cheaper_than_the_one_found(seed, steps, shares, switching, fixed):
     rng = np.random.default_rng(seed)
     cost, share = rng.uniform(0.0, 10.0, (steps, shares)), np.linspace(0.0, 1.0, shares)
