@@ -37,7 +37,7 @@ from iwm_power_manager.ros import diagnostics, messages, qos, realtime
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
-from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
+from iwm_power_manager.ros.parameters import ParameterError, check_change, declare, unknown
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 
@@ -87,6 +87,8 @@ class PowerManager(LifecycleNode):
             problem = f"cpu_affinity: {error}"
         if problem:
             raise ParameterError(f"parameter {problem}")
+        for line in unknown(self, config.SPECS):
+            self.get_logger().warning(line)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._lockstep: bool = self._values["lockstep"]

@@ -7,6 +7,7 @@ also what `docs/interface.md` is tested against.
 
 from __future__ import annotations
 
+import difflib
 import enum
 import json
 import math
@@ -29,6 +30,8 @@ Value = bool | int | float | str | list[str] | list[float]
 
 
 _WIDTH = 118
+#: Parameters that rclpy declares itself, some of them later.
+_ROS_PREFIXES = ("qos_overrides.", "start_type_description_service", "use_sim_time")
 
 
 class Change(enum.Enum):
@@ -138,6 +141,20 @@ def declare(node: Node, specs: Iterable[Spec]) -> dict[str, Any]:
             raise ParameterError(f"parameter {problem}")
         values[spec.name] = _plain(value)
     return values
+
+
+def unknown(node: Node, specs: Iterable[Spec]) -> list[str]:
+    """A line for each parameter given at start that the node does not have, with the nearest that it has.
+
+    They are no error: a file may give one set of parameters to all nodes (`/**`).
+    """
+    known = [spec.name for spec in specs]
+    lines = []
+    for name in sorted(set(node._parameter_overrides) - set(known)):
+        if not node.has_parameter(name) and not name.startswith(_ROS_PREFIXES):
+            near = difflib.get_close_matches(name, known, 1)
+            lines.append(f"parameter {name} is unknown and has no effect" + (f"; is {near[0]} meant?" if near else ""))
+    return lines
 
 
 def check_change(

@@ -42,13 +42,13 @@ class TestEveryWheel:
     def test_a_motor_torque_may_reach_the_peak_either_way(self, vehicle, wheel) -> None:
         assert violated_bound(command(one(wheel, PEAK)), vehicle) == ""
         assert violated_bound(command(one(wheel, -PEAK)), vehicle) == ""
-        assert violated_bound(command(one(wheel, PEAK + 5e-7)), vehicle) == ""
+        assert violated_bound(command(one(wheel, PEAK + 1e-6)), vehicle) == ""
         assert f"motor torque of wheel {wheel}" in violated_bound(command(one(wheel, PEAK + 2e-6)), vehicle)
         assert f"motor torque of wheel {wheel}" in violated_bound(command(one(wheel, -PEAK - 2e-6)), vehicle)
 
     def test_a_friction_brake_only_brakes_and_no_more_than_it_can(self, vehicle, wheel) -> None:
         assert violated_bound(command(friction=one(wheel, -BRAKE)), vehicle) == ""
-        assert violated_bound(command(friction=one(wheel, -BRAKE - 5e-7)), vehicle) == ""
+        assert violated_bound(command(friction=one(wheel, -BRAKE - 1e-6)), vehicle) == ""
         assert f"friction torque of wheel {wheel}" in violated_bound(
             command(friction=one(wheel, -BRAKE - 2e-6)), vehicle
         )

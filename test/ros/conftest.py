@@ -30,7 +30,8 @@ class Pair:
         namespace = f"/test_{os.getpid()}_{Pair._count}"
         self.bench = Bench(domain, lockstep=bool(parameters.get("lockstep")), namespace=namespace, sim_time=sim_time)
         remaps = {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics", "/clock": f"{namespace}/clock"}
-        self.arguments = arguments({**EQUAL, **parameters, "use_sim_time": sim_time}, remaps)
+        given = {name.replace("{namespace}", namespace): value for name, value in parameters.items()}
+        self.arguments = arguments({**EQUAL, **given, "use_sim_time": sim_time}, remaps)
         self._folder, self._domain = folder, domain
         self.running = self.start()
 

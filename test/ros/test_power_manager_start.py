@@ -11,7 +11,7 @@ from bench import Bench, Running, arguments
 
 from iwm_power_manager.files import read_yaml
 from iwm_power_manager.nodes import power_manager_config as config
-from iwm_power_manager.ros import messages
+from iwm_power_manager.ros import messages, qos
 from iwm_power_manager.share import resolve
 
 MODULE = "iwm_power_manager.nodes.power_manager"
@@ -82,6 +82,27 @@ def test_it_runs_from_its_parameter_file_in_a_namespace_with_remaps(tmp_path, co
     finally:
         running.process.kill()
         bench.close()
+
+
+def test_a_parameter_that_does_not_exist_is_warned_about(start_pair) -> None:
+    pair = start_pair({"frictoin": 0.3})
+    pair.bench.connect()
+    assert "parameter frictoin is unknown and has no effect; is friction meant?" in pair.running.text()
+    assert "use_sim_time" not in pair.running.text()
+
+
+def test_quality_of_service_can_be_overridden_by_parameters(start_pair) -> None:
+    override = "qos_overrides.{namespace}/power_demand.subscription.reliability"
+    pair = start_pair({override: "best_effort"})
+    bench = pair.bench
+    bench.node.destroy_publisher(bench.publishers[messages.POWER_DEMAND])
+    bench.publishers[messages.POWER_DEMAND] = bench.node.create_publisher(
+        messages.TOPIC_TYPES[messages.POWER_DEMAND],
+        messages.POWER_DEMAND,
+        qos.profile(lockstep=False, reliability="best_effort"),
+    )
+    bench.connect()
+    bench.drive(lambda: bench.mode() == 1, "normal operation")
 
 
 def test_the_parameter_file_holds_every_parameter_with_its_default() -> None:
