@@ -82,7 +82,7 @@ def test_the_identity_is_the_files_checksum(tmp_path) -> None:
 def test_a_policy_for_another_car_is_refused(tmp_path) -> None:
     other = with_idle_drive(CAR, "enabled" if CAR.idle_drive != "enabled" else "none")
     write_policy(tmp_path / "other.npz", 0.9, other)
-    with pytest.raises(PolicyError, match="was solved for"):
+    with pytest.raises(PolicyError, match="holds no policy for"):
         choose_policies(str(tmp_path), "sdp", "none", RULE, CAR)
 
 

@@ -35,7 +35,7 @@ def run_of(steps=100, **columns):
 def test_without_arguments_it_drives_nycc_with_the_shipped_policy_in_lockstep():
     plan = demo.parse([])
     assert plan.cycle == "config/cycles/nycc.csv"
-    assert (plan.policy, plan.strategy) == ("policies", "sdp")
+    assert (plan.policy, plan.strategy) == ("policies", "sdp_lookahead")
     assert plan.rate_hz >= 50.0
     assert plan.record
     assert not plan.realtime
