@@ -248,42 +248,40 @@ def _judge_wheel(
     limits: WheelLimits,
     moving_radps: float,
 ) -> tuple[WheelVerdict, WheelMemory]:
-    if value == memory.received_radps:
-        memory = memory._replace(unchanged_s=memory.unchanged_s + dt_s)
-    else:
-        memory = memory._replace(unchanged_s=0.0, other_radps=other, car_radps=car)
+    changed = value != memory.received_radps
+    other_then = other if changed else memory.other_radps
+    car_then = car if changed else memory.car_radps
+    unchanged_s = 0.0 if changed else memory.unchanged_s + dt_s
     strayed = abs(value - other) > limits.stray_radps and abs(value - car) > abs(other - car)
-    memory = memory._replace(
-        stray_s=memory.stray_s + dt_s if strayed else 0.0,
-        elapsed_s=memory.elapsed_s + dt_s,
-        distrust_s=max(memory.distrust_s - dt_s, 0.0),
-        received_radps=value,
+    stray_s = memory.stray_s + dt_s if strayed else 0.0
+    elapsed_s = memory.elapsed_s + dt_s
+    speed = memory.speed_radps
+    distrust_s = max(memory.distrust_s - dt_s, 0.0)
+    stuck = (
+        unchanged_s > limits.stuck_s
+        and abs(other - other_then) > limits.stuck_change_radps
+        and abs(car - car_then) > limits.stuck_change_radps
     )
-    verdict = _wheel_verdict(value, other, car, memory, limits, moving_radps)
-    if verdict is not WheelVerdict.GOOD:
-        return verdict, memory._replace(distrust_s=limits.distrust_s)
-    memory = memory._replace(speed_radps=value, elapsed_s=0.0)
-    return (WheelVerdict.DISTRUSTED if memory.distrust_s > 0.0 else WheelVerdict.GOOD), memory
+    opposite = car > moving_radps and value < -limits.opposite_radps
+    verdict = _WHEEL_VERDICTS.get(check_value(value, speed, elapsed_s, limits.value))
+    if verdict is None:
+        if opposite:
+            verdict = WheelVerdict.OPPOSITE
+        elif stuck:
+            verdict = WheelVerdict.STUCK
+        elif stray_s > limits.stray_s:
+            verdict = WheelVerdict.STRAYED
+    if verdict is None:
+        speed, elapsed_s = value, 0.0
+        verdict = WheelVerdict.DISTRUSTED if distrust_s > 0.0 else WheelVerdict.GOOD
+    else:
+        distrust_s = limits.distrust_s
+    return verdict, WheelMemory(speed, elapsed_s, unchanged_s, value, other_then, car_then, stray_s, distrust_s)
 
 
-def _wheel_verdict(
-    value: float, other: float, car: float, memory: WheelMemory, limits: WheelLimits, moving_radps: float
-) -> WheelVerdict:
-    violation = check_value(value, memory.speed_radps, memory.elapsed_s, limits.value)
-    if violation is Violation.NOT_FINITE:
-        return WheelVerdict.ABSENT
-    if violation is Violation.OUT_OF_RANGE:
-        return WheelVerdict.OUT_OF_RANGE
-    if violation is Violation.TOO_FAST:
-        return WheelVerdict.JUMPED
-    if car > moving_radps and value < -limits.opposite_radps:
-        return WheelVerdict.OPPOSITE
-    if (
-        memory.unchanged_s > limits.stuck_s
-        and abs(other - memory.other_radps) > limits.stuck_change_radps
-        and abs(car - memory.car_radps) > limits.stuck_change_radps
-    ):
-        return WheelVerdict.STUCK
-    if memory.stray_s > limits.stray_s:
-        return WheelVerdict.STRAYED
-    return WheelVerdict.GOOD
+#: What a value that is not accepted says about its wheel.
+_WHEEL_VERDICTS = {
+    Violation.NOT_FINITE: WheelVerdict.ABSENT,
+    Violation.OUT_OF_RANGE: WheelVerdict.OUT_OF_RANGE,
+    Violation.TOO_FAST: WheelVerdict.JUMPED,
+}
