@@ -204,7 +204,7 @@ def test_what_is_no_vehicle_file_is_refused_with_its_name(tmp_path, text):
         load_vehicle(tmp_path / "nowhere.yaml")
 
 
-# --- What comes out -----------------------------------------------------------------------------------------------------
+# --- What comes out --------------------------------------------------------------------------------------------------
 
 
 def test_the_paper_s_car_has_the_paper_s_numbers():
@@ -241,7 +241,11 @@ def test_idle_drive_can_be_replaced():
         other = load_vehicle(PAPER, name)
         assert other.idle_drive == name
         again = with_idle_drive(car, name)
-        assert (again.hash, again.idle_drive, again.params.motor.idle_drive) == (other.hash, name, other.params.motor.idle_drive)
+        assert (again.hash, again.idle_drive, again.params.motor.idle_drive) == (
+            other.hash,
+            name,
+            other.params.motor.idle_drive,
+        )
     assert len({load_vehicle(PAPER, name).hash for name in ("none", "drag", "enabled")}) == 3
     with pytest.raises(ConfigError, match=r"idle_drive: 'off' is unknown; allowed: none \| drag \| enabled"):
         load_vehicle(PAPER, "off")
@@ -280,7 +284,7 @@ def test_the_hub_motor_has_its_own_losses():
     assert enabled_loss_w(t, w, motor) == pytest.approx(40 + 1.57 * w + 0.0166 * w**2 + 1.50 * t + 0.045 * t**2)
 
 
-# --- Motor maps -----------------------------------------------------------------------------------------------------------
+# --- Motor maps ------------------------------------------------------------------------------------------------------
 
 
 def test_the_shipped_map_is_that_of_the_loss_coefficients():
@@ -341,7 +345,15 @@ def test_spaces_blank_lines_and_the_order_of_rows_do_not_matter(tmp_path):
     rows = ("10,20,0.8", "10,40,0.5", "50,20,0.9", "50,40,0.85")
     tidy = load_efficiency_map(write(tmp_path, *rows))
     messy = load_efficiency_map(
-        write(tmp_path, rows[3], "", f" {rows[0]} ".replace(",", " , "), rows[2], rows[1], header="speed_rad_s, torque_nm ,efficiency")
+        write(
+            tmp_path,
+            rows[3],
+            "",
+            f" {rows[0]} ".replace(",", " , "),
+            rows[2],
+            rows[1],
+            header="speed_rad_s, torque_nm ,efficiency",
+        )
     )
     assert all(np.array_equal(a, b) for a, b in zip(tidy, messy, strict=True))
 
@@ -381,7 +393,9 @@ def test_a_bad_row_is_named(tmp_path, rows, words):
 
 @pytest.mark.parametrize("header", ["", "speed,torque,efficiency", "torque_nm,speed_rad_s,efficiency"])
 def test_a_wrong_header_is_named(tmp_path, header):
-    with pytest.raises(ConfigError, match=r"map\.csv: line 1: .* is no header; allowed: speed_rad_s,torque_nm,efficiency"):
+    with pytest.raises(
+        ConfigError, match=r"map\.csv: line 1: .* is no header; allowed: speed_rad_s,torque_nm,efficiency"
+    ):
         load_efficiency_map(write(tmp_path, *GOOD, header=header))
 
 
@@ -399,7 +413,12 @@ def test_a_map_s_path_is_seen_from_the_vehicle_file(tmp_path):
     write(tmp_path, *GOOD)
     text = (FOLDER / "jalalmaab_2015_map.yaml").read_text().replace("../motors/siemens_pm_7500w.csv", "../map.csv")
     (tmp_path / "cars" / "car.yaml").write_text(text)
-    assert load_vehicle(tmp_path / "cars" / "car.yaml").params.motor.map_torque_nm.tolist() == [-40.0, -20.0, 20.0, 40.0]
+    assert load_vehicle(tmp_path / "cars" / "car.yaml").params.motor.map_torque_nm.tolist() == [
+        -40.0,
+        -20.0,
+        20.0,
+        40.0,
+    ]
     (tmp_path / "map.csv").unlink()
     with pytest.raises(ConfigError, match=r"map\.csv: cannot be read"):
         load_vehicle(tmp_path / "cars" / "car.yaml")

@@ -335,8 +335,8 @@ def it_does_what_the_plain_law_does(case):
 
     axles, share, decided, bits = oracle.step(case.m, case.before, case.settings, case.car, decide)
     command, after = case.command, case.after
-    if math.isnan(axles[0].motor + axles[1].motor):
-        return  # several answers are right; the battery's own check stands above
+    if math.isnan(axles[0].motor + axles[1].motor) or axles[0].doubtful or axles[1].doubtful:
+        return  # several answers are right: battery and gate have checks of their own
 
     def near(value):
         return pytest.approx(value, rel=1e-8, abs=1e-7)

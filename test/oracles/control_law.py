@@ -87,6 +87,7 @@ class Axle:
     was_gated: bool
     heat: float
     gated: bool = False
+    doubtful: bool = False  # so near to its edge that rounding decides
     slip: float = 0.0
     road: float = 0.0
     asked: float = 0.0
@@ -144,6 +145,7 @@ def step(m, state, settings, vehicle, decide):
 
     for axle in axles:
         edge = settings.critical_slip - (settings.gate_hysteresis if axle.was_gated else 0.0)
+        axle.doubtful = abs(abs(axle.slip) - edge) < 1e-12
         if settings.gate_mode != t.GATE_MODE_OFF and m.power_demand_w != 0.0:
             spinning = settings.gate_driving and not braking and axle.slip > edge
             axle.gated = spinning or (braking and -axle.slip > edge)
