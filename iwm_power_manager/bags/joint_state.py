@@ -17,8 +17,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 _STAMP = struct.Struct("<iI")
 _STAMP_OFFSET = 4  # behind the encapsulation
 _AFTER_STAMP = _STAMP_OFFSET + _STAMP.size
-#: Lengths of the empty fields behind each field.
-_TAIL_BYTES = {"position": 8, "velocity": 4, "effort": 0}
+_FIELDS = ("position", "velocity", "effort")
 _LITTLE_ENDIAN = b"\x00\x01"
 _NS_PER_S = 1_000_000_000
 
@@ -41,7 +40,7 @@ class JointStateDecoder:
 
     def __init__(self, field: str) -> None:
         self._field = field
-        self._tail_bytes = _TAIL_BYTES[field]
+        self._start = 0
         self._head = b""
         self._length = 0
         self._names: tuple[str, ...] = ()
@@ -49,7 +48,7 @@ class JointStateDecoder:
 
     def __call__(self, data: bytes) -> NamedValues:
         """Stamp, names and values of a message; raises what the generated decoder raises if it is damaged."""
-        start = self._length - self._tail_bytes - self._numbers.size
+        start = self._start
         if len(data) != self._length or data[_AFTER_STAMP:start] != self._head or not self._names:
             return self._decode(data)
         seconds, nanoseconds = _STAMP.unpack_from(data, _STAMP_OFFSET)
@@ -62,10 +61,13 @@ class JointStateDecoder:
         if len(names) != len(values):
             raise ValueError(f"{len(names)} names and {len(values)} values")
         numbers = struct.Struct(f"<{len(values)}d")
-        start = len(data) - self._tail_bytes - numbers.size
-        plain = data[:2] == _LITTLE_ENDIAN and names and not data[start + numbers.size :].strip(b"\0")
-        if plain and numbers.pack(*values) == data[start : start + numbers.size]:
-            self._head, self._length, self._names, self._numbers = data[_AFTER_STAMP:start], len(data), names, numbers
+        behind = _FIELDS[_FIELDS.index(self._field) + 1 :]
+        # Each field is its length and, if it has any, its numbers on the next multiple of eight.
+        tail_bytes = sum(8 + 8 * count if (count := len(getattr(message, name))) else 4 for name in behind)
+        start = len(data) - tail_bytes - numbers.size
+        if data[:2] == _LITTLE_ENDIAN and names and numbers.pack(*values) == data[start : start + numbers.size]:
+            self._head, self._start, self._length = data[_AFTER_STAMP:start], start, len(data)
+            self._names, self._numbers = names, numbers
         stamp = message.header.stamp
         return NamedValues(int(stamp.sec) * _NS_PER_S + int(stamp.nanosec), names, values)
 
@@ -89,7 +91,8 @@ class JointStateEncoder:
         message = types[JOINT_STATE](header=header, name=list(names), **fields)
         self._template = bytes(typestore().serialize_cdr(message, JOINT_STATE))
         self._numbers = struct.Struct(f"<{len(names)}d")
-        self._start = len(self._template) - _TAIL_BYTES[field] - self._numbers.size
+        behind = len(_FIELDS) - 1 - _FIELDS.index(field)  # empty fields, a length of four bytes each
+        self._start = len(self._template) - 4 * behind - self._numbers.size
 
     def __call__(self, stamp_ns: int, values: Sequence[float]) -> bytes:
         """The message's CDR bytes."""

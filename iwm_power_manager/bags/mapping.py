@@ -19,7 +19,9 @@ from typing import Any, NamedTuple
 from ..errors import BagError, ConfigError
 from ..files import check_choice, check_keys, check_number, dotted, read_yaml
 from ..share import share_path
+from .cdr import number_reader
 from .definitions import learn_definition, typestore
+from .joint_state import JOINT_STATE, JointStateDecoder
 from .metadata import Topic
 
 DEFAULT_MAPPING = "config/bags/project.yaml"
@@ -87,11 +89,13 @@ class Extractor(NamedTuple):
     signal : one of `SIGNALS`
     wheel : which wheel the value is for; -1 for all four, or for a signal that has no wheels
     read : values from a message of this topic, after deserialisation
+    quick : the same from its little-endian CDR bytes; None if there is no quick way
     """
 
     signal: str
     wheel: int
     read: Callable[[Any], tuple[float, ...]]
+    quick: Callable[[bytes], tuple[float, ...]] | None
 
 
 def load_mapping(path: Path | str | None = None) -> SignalMapping:
@@ -173,8 +177,10 @@ def extractors(mapping: SignalMapping, topics: Mapping[str, Topic]) -> dict[str,
             topic = topics[name]
             learn_definition(topic)
             key = dotted("signals", signal)
-            read = _reader(mapping.path, key, source, topic, all_wheels=signal == "wheel_speed" and len(sources) == 1)
-            found.setdefault(name, []).append(Extractor(signal, wheel if len(sources) > 1 else -1, read))
+            all_wheels = signal == "wheel_speed" and len(sources) == 1
+            read = _reader(mapping.path, key, source, topic, all_wheels=all_wheels)
+            quick = _quick_wheels(source, topic) if all_wheels else _quick_number(source, topic)
+            found.setdefault(name, []).append(Extractor(signal, wheel if len(sources) > 1 else -1, read, quick))
     return found
 
 
@@ -216,6 +222,26 @@ def _reader(file: Path, key: str, source: Source, topic: Topic, all_wheels: bool
     if not all_wheels:
         return number
     return by_name if names else in_order
+
+
+def _quick_number(source: Source, topic: Topic) -> Callable[[bytes], tuple[float, ...]] | None:
+    read = number_reader(topic.type, source.field.split("."))
+    factor = source.factor
+    return None if read is None else lambda data: (factor * float(read(data)),)
+
+
+def _quick_wheels(source: Source, topic: Topic) -> Callable[[bytes], tuple[float, ...]] | None:
+    if topic.type != JOINT_STATE or not source.names:
+        return None
+    decode, factor, wanted = JointStateDecoder(source.field), source.factor, source.names
+
+    def read(data: bytes) -> tuple[float, ...]:
+        _, names, values = decode(data)
+        if names == wanted:
+            return tuple(factor * value for value in values)
+        return tuple(factor * values[names.index(name)] if names.count(name) == 1 else math.nan for name in wanted)
+
+    return read
 
 
 def _field_kind(msgtype: str, path: list[str]) -> str:

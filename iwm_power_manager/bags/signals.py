@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,11 +14,16 @@ from numpy.typing import NDArray
 from ..errors import BagError
 from ..model.pedals import pedal_power_w
 from ..vehicle import VehicleParams
+from .cdr import PLAIN
 from .definitions import typestore
 from .mapping import Extractor, SignalMapping, extractors, load_mapping
 from .reader import BagReader
 
 FloatArray = NDArray[np.float64]
+
+#: A header stands first, and its stamp first in it: behind the four bytes of encapsulation.
+_STAMP = struct.Struct("<iI")
+_STAMP_OFFSET = 4
 
 #: Signals that may be NaN in a good message: not measured.
 MAY_BE_UNKNOWN = frozenset({"battery_temperature"})
@@ -81,6 +87,12 @@ class SignalStream:
         self._extractors = extractors(mapping, bag.topics)
         self.signals = {extractor.signal for found in self._extractors.values() for extractor in found}
         self._decoders = {name: decoder(bag.topics[name].type) for name in self._extractors}
+        # Topics all of whose signals have a quick way: whether a header, and so a stamp, stands first.
+        self._quick = {
+            name: has_header(bag.topics[name].type)
+            for name, found in self._extractors.items()
+            if all(extractor.quick is not None for extractor in found)
+        }
 
     @property
     def topics(self) -> set[str]:
@@ -97,28 +109,50 @@ class SignalStream:
         if found is None:
             return []
         try:
-            message = self._decoders[topic](data)
-            values = [self._value(extractor, message, log_time_ns, publish_time_ns) for extractor in found]
+            if topic in self._quick and data[1] == PLAIN:
+                values = self._quick_values(topic, found, data, log_time_ns, publish_time_ns)
+            else:
+                values = self._decoded_values(topic, found, data, log_time_ns, publish_time_ns)
         except Exception:  # noqa: BLE001 - generated decoders raise whatever a damaged message makes them raise
             self.bad_messages += 1
             return []
-        finite = [value for value in values if all(map(math.isfinite, value.values))]
-        # A battery without a thermometer says NaN, and means it.
-        if any(value.signal not in MAY_BE_UNKNOWN for value in values if value not in finite):
-            self.bad_messages += 1
-            return []
-        return finite
+        for value in values:
+            for number in value.values:
+                if not math.isfinite(number):
+                    return self._without_unknown(values)
+        return values
 
-    @staticmethod
-    def _value(extractor: Extractor, message: Any, log_time_ns: int, publish_time_ns: int) -> SignalValue:
-        return SignalValue(
-            log_time_ns,
-            stamp_of(message),
-            extractor.signal,
-            extractor.wheel,
-            extractor.read(message),
-            publish_time_ns,
-        )
+    def _quick_values(
+        self, topic: str, found: list[Extractor], data: bytes, log_time_ns: int, publish_time_ns: int
+    ) -> list[SignalValue]:
+        stamp_ns = None
+        if self._quick[topic]:
+            seconds, nanoseconds = _STAMP.unpack_from(data, _STAMP_OFFSET)
+            stamp_ns = seconds * 1_000_000_000 + nanoseconds
+        return [
+            SignalValue(log_time_ns, stamp_ns, signal, wheel, quick(data), publish_time_ns)
+            for signal, wheel, _, quick in found
+            if quick is not None
+        ]
+
+    def _decoded_values(
+        self, topic: str, found: list[Extractor], data: bytes, log_time_ns: int, publish_time_ns: int
+    ) -> list[SignalValue]:
+        message = self._decoders[topic](data)
+        stamp_ns = stamp_of(message)
+        return [
+            SignalValue(log_time_ns, stamp_ns, signal, wheel, read(message), publish_time_ns)
+            for signal, wheel, read, _ in found
+        ]
+
+    def _without_unknown(self, values: list[SignalValue]) -> list[SignalValue]:
+        """The finite values, if only such are missing that may be: a battery without a thermometer says NaN."""
+        finite = [value for value in values if all(map(math.isfinite, value.values))]
+        missing = {value.signal for value in values} - {value.signal for value in finite}
+        if missing <= MAY_BE_UNKNOWN:
+            return finite
+        self.bad_messages += 1
+        return []
 
 
 def decoder(msgtype: str) -> Callable[[bytes], Any]:
@@ -133,6 +167,12 @@ def stamp_of(message: Any) -> int | None:
     if header is None:
         return None
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def has_header(msgtype: str) -> bool:
+    """Whether a known type begins with a `std_msgs/Header`."""
+    fields = typestore().fielddefs[msgtype][1]
+    return bool(fields) and fields[0][0] == "header" and fields[0][1][1] == "std_msgs/msg/Header"
 
 
 def read_signal(
