@@ -212,11 +212,17 @@ def _comparison(
     return Comparison(plant["time_s"], plant["speed_mps"], model["speed_mps"], plant["soc"], model["soc"])
 
 
+def check_picture(path: str) -> str:
+    """Kind of picture a file name stands for, "svg" or "png"; anything else is a `ConfigError`."""
+    kind = Path(path).suffix.lower().removeprefix(".")
+    if kind not in ("svg", "png"):
+        raise ConfigError("arguments", "--plot", f"{path} is no picture's name", "a name that ends in .svg or .png")
+    return kind
+
+
 def save_picture(made: Fit, path: str) -> None:
     """Fig. 7 as an SVG or PNG file."""
-    kind = Path(path).suffix.lower()
-    if kind not in (".svg", ".png"):
-        raise ConfigError("arguments", "--plot", f"{path} is no picture's name", "a name that ends in .svg or .png")
+    kind = check_picture(path)
     stream = io.BytesIO()
-    figures.model_comparison(*made.comparison).savefig(stream, format=kind[1:], dpi=150, facecolor="white")
+    figures.model_comparison(*made.comparison).savefig(stream, format=kind, dpi=150, facecolor="white")
     atomic_write(path, stream.getvalue())

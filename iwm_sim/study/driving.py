@@ -67,6 +67,8 @@ def on_all_cores(
         pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.terminate()
+        for process in processes:
+            process.join()
         raise
     pool.shutdown()
     return [made[index] for index in range(len(items))]

@@ -388,6 +388,8 @@ def _make_folder(path: str) -> None:
 
 
 def _fit_battery(options: argparse.Namespace) -> None:
+    if options.plot:
+        battery_fit.check_picture(options.plot)
     fit = battery_fit.fit(
         options.vehicle,
         options.idle_drive[0],

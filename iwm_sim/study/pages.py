@@ -68,6 +68,7 @@ def tables(content: Content) -> list[TableOf]:
     return [
         _criteria(content),
         *_paper_tables(content),
+        _cell_by_cell(content),
         *_table_6(content),
         *_rivals(content),
         _stops(content),
@@ -135,6 +136,71 @@ def _paper_tables(content: Content) -> Iterator[TableOf]:
 def _traces(rows: Iterator[Row]) -> str:
     lost = [str(row["label"]) for row in rows if not row["trace_held"]]
     return f"lost: {', '.join(lost)}" if lost else "held"
+
+
+def _cell_by_cell(content: Content) -> TableOf:
+    """Every printed saving beside what is possible here, with a verdict."""
+    by_cell = criteria.cells(content["cells"])
+    rows = []
+    for friction in paper.FRICTIONS:
+        for cycle in _cycles(content):
+            none, drag = (by_cell.get(f"{cycle} {friction:g} {idle_drive}") for idle_drive in _IDLE_DRIVES)
+            if cycle not in paper.CYCLES or none is None or drag is None:
+                continue
+            printed = paper.cell(cycle, friction)
+            rows.append(
+                {
+                    "cycle": cycle,
+                    "friction": friction,
+                    "ratio": printed["ED"] / none[criteria.ED]["delta_soc_percent"],
+                    "printed": printed["saving"],
+                    "SDP none": none[PAPER_SDP]["saving_percent"],
+                    "ours none": none[criteria.OURS]["saving_percent"],
+                    "bound none": none[FREE_BOUND]["saving_percent"],
+                    "SDP drag": drag[PAPER_SDP]["saving_percent"],
+                    "ours drag": drag[criteria.OURS]["saving_percent"],
+                    "bound drag": drag[FREE_BOUND]["saving_percent"],
+                    "verdict": _verdict(printed["saving"], none, drag),
+                }
+            )
+    columns = (
+        Column("cycle", "Cycle"),
+        Column("friction", "Friction", "", 1),
+        Column("ratio", "ED: printed ΔSoC over ours", "", 2),
+        Column("printed", "printed saving", "%", 2),
+        *(
+            Column(f"{kind} {idle_drive}", f"{label}, {idle_drive}", "%", 2)
+            for idle_drive in _IDLE_DRIVES
+            for kind, label in (("SDP", "paper's problem"), ("ours", "ours"), ("bound", "possible"))
+        ),
+        Column("verdict", "The printed saving"),
+    )
+    return TableOf(
+        "Cell by cell",
+        "",
+        columns,
+        rows,
+        "Savings against equal split, each for idle drive none and drag. Possible: with the whole cycle known and "
+        "changes of the split free.",
+    )
+
+
+def _verdict(printed_percent: float, none: Mapping[str, Row], drag: Mapping[str, Row]) -> str:
+    possible_none, possible_drag = (by[FREE_BOUND]["saving_percent"] for by in (none, drag))
+    reached = none[PAPER_SDP]["saving_percent"]
+    if possible_none is None or possible_drag is None or reached is None:
+        return "cannot be compared: the runs covered different distances"
+    if printed_percent > possible_none:
+        first = "is more than any split can save here"
+    elif printed_percent > possible_drag:
+        first = "is possible only if an idle axle costs nothing"
+    else:
+        first = "is possible, even with an idle axle that drags"
+    if reached >= printed_percent:
+        return f"{first}; the paper's problem reaches it"
+    if reached > 0.0:
+        return f"{first}; the paper's problem saves less"
+    return f"{first}; the paper's problem saves nothing here"
 
 
 def _table_6(content: Content) -> Iterator[TableOf]:

@@ -23,7 +23,7 @@ from iwm_power_manager.control.types import GATE_MODES, default_settings
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.policy import Policy
-from iwm_power_manager.vehicle import pack_energy_wh
+from iwm_power_manager.vehicle import Vehicle, pack_energy_wh
 from iwm_sim.study import battery_fit, cases, criteria, pages, paper, sensitivity, skid
 from iwm_sim.study.cases import Case, Change, Result, Rule, SensorNoise
 from iwm_sim.study.driving import on_all_cores, warm_up
@@ -130,7 +130,7 @@ def study(
         tasks += [functools.partial(_all_stops, stops)]
         bar.total = len(tasks)
         bar.refresh()
-        made = on_all_cores(_call, tasks, jobs, lambda _: bar.update())
+        made = on_all_cores(_call, tasks, jobs, lambda _: _tick(bar))
     results: list[Result] = made[: len(_all(plan))]
     content = _content(vehicle, plan, results, made[-2], made[-1], ours, paper_policies)
     key = (IDLE_DRIVES[0], paper.FRICTIONS[0])
@@ -148,11 +148,15 @@ def study(
     return content
 
 
+def _tick(bar: Any) -> None:
+    bar.update()
+
+
 def _call(task: Callable[[], Any]) -> Any:
     return task()
 
 
-def _car(vehicle: str, idle_drive: str) -> cases.Vehicle:
+def _car(vehicle: str, idle_drive: str) -> Vehicle:
     return cases.vehicle_of(vehicle, idle_drive)
 
 

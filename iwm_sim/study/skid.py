@@ -11,6 +11,7 @@ from iwm_power_manager.control import law
 from iwm_power_manager.control.types import GATE_MODES, STRATEGIES, default_settings, initial_state
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.tyre import slip_ratio
+from iwm_power_manager.policy import empty_table
 from iwm_power_manager.vehicle import VehicleParams
 from iwm_sim import closed_loop, plant
 from iwm_sim.metrics import CRITICAL_SLIP, MOVING_MPS, longest_s
@@ -65,7 +66,7 @@ def emergency_stop(stop: Stop) -> dict[str, Any]:
     settings = default_settings(stop.strategy)._replace(gate_mode=GATE_MODES[stop.gate_mode])
     if stop.gate_mode == "table2":
         settings = settings._replace(gate_hysteresis=0.0, gate_driving=False)  # as printed
-    table = cases.policy_of(stop.policy).table() if stop.policy else cases.empty_table()
+    table = cases.policy_of(stop.policy).table() if stop.policy else empty_table()
     road = (stop.friction,) * 4
     rolling = params.wheel.radius_m
     car = plant.initial_plant(params, 0.8, stop.from_mps)
