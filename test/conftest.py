@@ -20,7 +20,7 @@ settings.register_profile("nightly", settings.get_profile("default"), max_exampl
 settings.register_profile(
     "mutation",
     settings.get_profile("default"),
-    max_examples=200,
+    max_examples=100,
     derandomize=True,
     database=None,
     phases=(Phase.explicit, Phase.generate),
