@@ -180,6 +180,10 @@ class McapFile:
         if sync:
             os.fdatasync(self._stream.fileno())
 
+    def duplicate_descriptor(self) -> int:
+        """A descriptor of the open file that stays valid when this one is closed."""
+        return os.dup(self._stream.fileno())
+
     def _write_chunk(self) -> None:
         raw = bytes(self._chunk)
         used = {channel: index for channel, index in self._index.items() if index}

@@ -186,6 +186,10 @@ class BagWriter:
         except OSError as error:
             raise self._failed(error) from None
 
+    def duplicate_descriptor(self) -> int:
+        """A descriptor of the current file, for whoever wants to wait for the disk; theirs to close."""
+        return self._file.duplicate_descriptor()
+
     def split(self) -> None:
         """Close the current file and begin the next."""
         if not self._file_has_message:

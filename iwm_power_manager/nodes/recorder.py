@@ -72,7 +72,7 @@ _STATUS_PERIOD_S = 1.0
 _DISCOVERY_FAST_S = 0.05
 _DISCOVERY_SLOW_S = 0.25
 #: The publisher learns of the match a little after the subscription does.
-_SETTLE_S = 0.2
+_SETTLE_S = 0.5
 #: After the signal to end: taking goes on until nothing has come for the one, at most for the other.
 _FINAL_QUIET_S = 0.1
 _FINAL_WAIT_S = 2.0
@@ -101,7 +101,7 @@ PARAMETERS = (
     _spec("compression", "zstd", "Compression of the chunks.", choices=COMPRESSIONS),
     _spec("chunk_bytes", 786_432, "Uncompressed size at which a chunk is written, bytes.", 1024, 64 * _MEBIBYTE),
     _spec("flush_period_s", 0.5, "Longest time a message is in memory only, s.", 0.05, 60.0),
-    _spec("sync", True, "Wait at each flush until the disk has the data, so that a power cut loses no more."),
+    _spec("sync", True, "Have the disk take the data at each flush, so that a power cut loses hardly more."),
     _spec("max_bytes", 0, "Size at which the next file of the bag begins, bytes; 0: never.", 0, 2**62),
     _spec("max_duration_s", 0.0, "Time after which the next file of the bag begins, s; 0: never.", 0.0, 1e9),
     _spec("max_message_bytes", 64 * _MEBIBYTE, "A larger message is dropped and counted, bytes.", 1, 2**31),
