@@ -283,7 +283,7 @@ def system_cases() -> Iterator[Case]:
 def clock_cases() -> Iterator[Case]:
     """What simulated time can do."""
     for shift_s, text in ((5.0, "5 s ahead"), (-5.0, "5 s back")):
-        yield Case(f"clock jumps {text}", ZERO, on("clock", partial(relay.Restamp, shift_s)), allowed_s=0.1)
+        yield Case(f"clock jumps {text}", ZERO, on("clock", partial(relay.Restamp, shift_s)))
     yield Case("clock stops", ZERO, on("clock", lambda: relay.stop),
                allowed_s=float(config.DEFAULTS["clock_stopped_s"]) + 0.1)  # fmt: skip
 
@@ -412,7 +412,7 @@ def show(result: Result) -> str:
     return (
         f"{result.name:38} {result.expect:14} {seconds(result.to_zero_s):>7} {result.largest_nm:>8.1f} "
         f"{seconds(result.recovery_s):>8} {seconds(result.longest_gap_s):>6} {result.commands:>5}  {verdict}"
-        + (f"  [{result.said}]" if result.said else "")
+        + (f"  [{result.said.split(';')[0]}]" if result.said else "")
     )
 
 

@@ -99,8 +99,15 @@ class Controller:
         """Bits of the wheels that are not believed."""
         return sum(1 << i for i, verdict in enumerate(self.monitor.verdicts) if verdict is not WheelVerdict.GOOD)
 
-    def step(self, now_ns: int, dt_s: float) -> Step:
-        """One control step at a time, `dt_s` after the previous one.
+    def step(self, now_ns: int, dt_s: float, elapsed_s: float | None = None) -> Step:
+        """One control step.
+
+        Parameters
+        ----------
+        now_ns : time of the step, as inputs are stamped
+        dt_s : step the law is to take
+        elapsed_s : time that really has passed, where the loop was held up and `dt_s` is bounded; None: `dt_s`.
+            Torque fades by the clock; it comes back by the steps in which inputs were seen to be good
 
         Raises
         ------
@@ -111,7 +118,8 @@ class Controller:
         age_s = self.monitor.ages_s(now_ns)
         if self._limits.age_s:
             stale = stale_inputs(age_s, self._limits.age_s)
-            self.supervision = supervise(self.supervision, stale, dt_s, self._limits.supervision)
+            passed_s = max(elapsed_s or dt_s, dt_s) if stale else dt_s
+            self.supervision = supervise(self.supervision, stale, passed_s, self._limits.supervision)
         measurement = self._measurement(dt_s)
         settings = self._settings()
         command, after = law.step(measurement, self.state, settings, self._vehicle, self.policy)

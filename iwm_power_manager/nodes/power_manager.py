@@ -374,7 +374,7 @@ class PowerManager(LifecycleNode):
         self._last_step_ns = stamp_ns
         self._last_step_steady_s = time.monotonic()
         try:
-            command, numbers = self._controller.step(stamp_ns, dt_s)
+            command, numbers = self._controller.step(stamp_ns, dt_s, since_s)
         except ControlFaultError as error:
             self.fail(str(error))
             return

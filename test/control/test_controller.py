@@ -58,9 +58,9 @@ class Drive:
         self.steps: list[dict[str, float]] = []
         self.commands: list[Any] = []
 
-    def step(self) -> dict[str, float]:
-        self.now_ns += 10 * MS
-        command, numbers = self.controller.step(self.now_ns, DT)
+    def step(self, elapsed_s: float | None = None) -> dict[str, float]:
+        self.now_ns += 10 * MS if elapsed_s is None else round(elapsed_s * 1e9)
+        command, numbers = self.controller.step(self.now_ns, DT, elapsed_s)
         self.commands.append(command)
         self.steps.append(dict(zip(SIGNAL_NAMES, numbers, strict=True)))
         return self.steps[-1]
@@ -141,6 +141,25 @@ class TestMissingInputs:
         assert all(b <= a for a, b in itertools.pairwise(torques))
         assert torques[fade_steps] == 0.0
         assert all(max(motor(values)) == 0.0 == min(motor(values)) for values in after[first + fade_steps :])
+
+    def test_a_loop_that_is_held_up_fades_by_the_clock_and_not_by_its_steps(self, drive) -> None:
+        drive.run(60)
+        assert drive.step(0.15)["motor_factor"] == pytest.approx(0.5)
+        values = drive.step(0.2)
+        assert values["motor_factor"] == 0.0
+        assert values["dt_s"] == DT
+        assert motor(values) == [0.0] * 4
+
+    def test_time_that_was_not_seen_does_not_count_as_good(self, drive) -> None:
+        drive.run(60)
+        drive.run(60, without=("speed", "wheels", "demand", "battery"))
+        drive.now_ns += 10_000 * MS
+        drive.send()
+        _, numbers = drive.controller.step(drive.now_ns, DT, 10.0)
+        values = dict(zip(SIGNAL_NAMES, numbers, strict=True))
+        assert values["stale"] == 0
+        assert values["motor_factor"] == 0.0
+        assert drive.controller.supervision.healthy_s == DT
 
     def test_it_recovers_by_itself(self, drive) -> None:
         drive.run(60)
