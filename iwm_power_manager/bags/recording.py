@@ -46,7 +46,7 @@ class RecordingOptions:
     """
 
     writer: WriterOptions = field(default_factory=WriterOptions)
-    flush_period_s: float = 0.5
+    flush_period_s: float = 0.25
     sync: bool = True
     queue_bytes: int = 64 * 1024 * 1024
     snapshot_s: float = 0.0

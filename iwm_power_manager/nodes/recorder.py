@@ -100,7 +100,7 @@ PARAMETERS = (
     _spec("record", True, "Begin to record at once; false: wait for ~/start."),
     _spec("compression", "zstd", "Compression of the chunks.", choices=COMPRESSIONS),
     _spec("chunk_bytes", 786_432, "Uncompressed size at which a chunk is written, bytes.", 1024, 64 * _MEBIBYTE),
-    _spec("flush_period_s", 0.5, "Longest time a message is in memory only, s.", 0.05, 60.0),
+    _spec("flush_period_s", 0.25, "Longest time a message is in memory only, s.", 0.05, 60.0),
     _spec("sync", True, "Have the disk take the data at each flush, so that a power cut loses hardly more."),
     _spec("max_bytes", 0, "Size at which the next file of the bag begins, bytes; 0: never.", 0, 2**62),
     _spec("max_duration_s", 0.0, "Time after which the next file of the bag begins, s; 0: never.", 0.0, 1e9),
