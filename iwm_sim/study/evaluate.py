@@ -203,6 +203,9 @@ def parser() -> argparse.ArgumentParser:
     )
     other.add_argument("--plot", metavar="SVG|PNG", help="--fit-battery: the comparison as a picture")
     other.add_argument("--study", metavar="DIR", help="all tables and figures of the paper, and beyond, into a folder")
+    other.add_argument(
+        "--update-doc", metavar="MD", help="--study: also replace the generated part of this file (docs/study.md)"
+    )
     return result
 
 
@@ -217,6 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 policy=options.policy,
                 jobs=options.jobs,
                 quiet=options.quiet,
+                document=Path(options.update_doc) if options.update_doc else None,
             )
         elif options.fit_battery:
             _fit_battery(options)

@@ -95,7 +95,14 @@ class _Plan(NamedTuple):
 
 
 def study(
-    output: Path, *, vehicle: str, policy: str, jobs: int, quiet: bool, cycles: Sequence[str] = paper.CYCLES
+    output: Path,
+    *,
+    vehicle: str,
+    policy: str,
+    jobs: int,
+    quiet: bool,
+    document: Path | None = None,
+    cycles: Sequence[str] = paper.CYCLES,
 ) -> dict[str, Any]:
     """Make the whole study and write it into a folder: `study.json`, `study.html`, `study.md`, `figures/`.
 
@@ -105,6 +112,7 @@ def study(
     vehicle, policy : car, and folder or file of our policies for it
     jobs : processes
     quiet : no progress
+    document : Markdown file whose generated part is replaced; the study's JSON goes beside it
     cycles : driven in the tables; the first one is also that of the frontier, the robustness and the slips if the
         usual ones are not among them
     """
@@ -143,7 +151,11 @@ def study(
         chain=(convergence.chain.probability, convergence.chain.power_w),
     )
     pages.write(output, content, pages.drawn(content, material, _car(vehicle, IDLE_DRIVES[0]).params))
-    atomic_write(output / "study.json", (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+    stored = (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
+    atomic_write(output / "study.json", stored)
+    if document:
+        pages.update_document(document, content)
+        atomic_write(document.with_suffix(".json"), stored)
     say(f"{len(tasks)} runs in {time.perf_counter() - started:.0f} s: {output / 'study.html'}")
     return content
 

@@ -1,0 +1,46 @@
+"""The study as a whole, on a short cycle."""
+
+import json
+
+import pytest
+
+from iwm_power_manager.errors import ConfigError
+from iwm_sim.study import cases, policies, reproduce
+
+
+def test_a_folder_that_cannot_be_made_is_refused_at_once(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot be created"):
+        reproduce.study(tmp_path / "file" / "out", vehicle="jalalmaab_2015", policy="policies", jobs=1, quiet=True)
+
+
+def test_numbers_keep_six_digits_and_nan_becomes_null():
+    made = reproduce._rounded({"a": [1.23456789, float("nan")], "b": True, 3: "x"})
+    assert made == {"a": [1.23457, None], "b": True, "3": "x"}
+
+
+@pytest.mark.nightly
+@pytest.mark.timeout(1800)
+def test_the_whole_study_runs_on_a_short_cycle(hill, tmp_path, small_grid, monkeypatch):
+    monkeypatch.setattr(cases, "RULE_CYCLE", str(hill))
+    monkeypatch.setattr(reproduce, "PAPER_GRID_WITHOUT", reproduce.PAPER_GRID)
+    bank = tmp_path / "bank"
+    bank.mkdir()
+    monkeypatch.setattr(
+        reproduce,
+        "_our_policies",
+        lambda vehicle, _policy, say: {
+            (idle_drive, friction): policies.solved(
+                cases.vehicle_of(vehicle, idle_drive), friction, str(small_grid), say, cycles=(str(hill),)
+            )
+            for idle_drive in reproduce.IDLE_DRIVES
+            for friction in reproduce.paper.FRICTIONS
+        },
+    )
+    out = tmp_path / "out"
+    made = reproduce.study(out, vehicle="jalalmaab_2015", policy=str(bank), jobs=1, quiet=True, cycles=(str(hill),))
+    assert json.loads((out / "study.json").read_text()) == json.loads(json.dumps(made))
+    assert len(made["cells"]) == 6 * 9
+    assert len(made["gates"]) == 6 * 2
+    assert (out / "study.html").stat().st_size > 100_000
+    assert len(list((out / "figures").glob("*.svg"))) == 10
