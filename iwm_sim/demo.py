@@ -50,9 +50,9 @@ _PARTNER_TIMEOUT_S = 300.0
 #: What the simulator sends at its rate, which the power manager has to know to notice when it is missing.
 _PERIODIC_INPUTS = ("vehicle_speed", "wheel_states", "power_demand")
 _REFERENCE = "equal"
-_LOCK_STEP = "three processes over DDS, lock-step"
-_REAL_TIME = "three processes over DDS, real time"
-_ONE_PROCESS = "one process, no DDS"
+_LOCK_STEP = "over DDS, lock-step"
+_REAL_TIME = "over DDS, real time"
+_ONE_PROCESS = "in one process"
 
 
 @dataclass(frozen=True)

@@ -139,9 +139,9 @@ def test_the_table_shows_the_policy_beside_equal_distribution(finished) -> None:
     lines = finished.output.splitlines()
     (head,) = (number for number, line in enumerate(lines) if line.startswith("strategy "))
     assert lines[head + 3].startswith(STRATEGY)
-    assert lines[head + 3].endswith("three processes over DDS, lock-step")
+    assert lines[head + 3].endswith("over DDS, lock-step")
     assert lines[head + 4].startswith("equal")
-    assert lines[head + 4].endswith("one process, no DDS")
+    assert lines[head + 4].endswith("in one process")
 
 
 def test_the_result_is_there_as_json(finished) -> None:
