@@ -1,8 +1,9 @@
 """`python -m iwm_sim.soak`: half an hour in real time at 100 Hz; memory, deadlines and counts.
 
-Simulator, power manager and recorder run as in a car. Meanwhile this process samples the memory of each, and keeps a
-deadline of its own at the same rate with nothing to do: where the power manager is late and this process is late at the
-same moment, it was the machine. At the end the bag has to hold exactly what each topic's publisher says it published.
+Simulator, power manager and recorder run as in a car. Meanwhile this process samples the memory of each, keeps a deadline
+of its own at the same rate with nothing to do, and asks the kernel how long the power manager was ready to run and was
+not let: where the power manager is late and one of the two says so, it was the machine. At the end the bag has to hold
+exactly what each topic's publisher says it published.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import threading
 import time
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,16 +47,24 @@ _SIMULATED = (m.VEHICLE_SPEED, m.WHEEL_STATES, m.BATTERY_STATE, m.POWER_DEMAND, 
 
 
 class Witness(threading.Thread):
-    """Keeps a deadline at the control rate and notes when it was missed.
+    """Notes, at the control rate, what the machine did: whether it was late, and how long it let a process wait.
+
+    Parameters
+    ----------
+    pid : process whose main thread is watched
 
     Attributes
     ----------
-    late_s : wall-clock times at which this process came too late
+    late_s : wall-clock times at which this thread, with nothing to do, came too late
+    times_s, waited_s : when the watched thread was looked at, and how long it had been ready to run but not running
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pid: int) -> None:
         super().__init__(daemon=True)
+        self._schedule = Path(f"/proc/{pid}/schedstat")
         self.late_s: list[float] = []
+        self.times_s: list[float] = []
+        self.waited_s: list[float] = []
         self.stopped = threading.Event()
 
     def run(self) -> None:
@@ -67,6 +77,22 @@ class Witness(threading.Thread):
             if behind > (_LATE_PERIODS - 1.0) * _PERIOD_S:
                 self.late_s.append(time.time())
                 due += behind
+            with suppress(OSError, ValueError, IndexError):  # the process has ended, or the kernel does not say
+                waited_ns = int(self._schedule.read_text().split()[1])
+                self.times_s.append(time.time())
+                self.waited_s.append(waited_ns / 1e9)
+
+    def explains(self, before_s: float, after_s: float) -> bool:
+        """Whether the machine was late itself, or let the process wait for most of what a step came too late."""
+        index = bisect_left(self.late_s, before_s - _NEAR_S)
+        if index < len(self.late_s) and self.late_s[index] <= after_s + _NEAR_S:
+            return True
+        if not self.times_s:
+            return False
+        first = max(bisect_left(self.times_s, before_s - _PERIOD_S) - 1, 0)
+        last = min(bisect_left(self.times_s, after_s + _PERIOD_S), len(self.times_s) - 1)
+        waited_s = self.waited_s[last] - self.waited_s[first]
+        return waited_s >= 0.5 * (after_s - before_s - _PERIOD_S)
 
 
 class Recorded(NamedTuple):
@@ -119,17 +145,10 @@ def read_bag(path: Path) -> Recorded:
     return Recorded(dict(counts), step_ns, skipped, uncommanded, degraded)
 
 
-def late_steps(step_ns: Sequence[int], machine_late_s: Sequence[float]) -> tuple[int, int]:
-    """Late steps, and how many of them the machine's own lateness does not explain."""
-    own = total = 0
-    for before, after in itertools.pairwise(step_ns):
-        if after - before <= _LATE_PERIODS * _PERIOD_S * 1e9:
-            continue
-        total += 1
-        index = bisect_left(machine_late_s, before / 1e9 - _NEAR_S)
-        if index == len(machine_late_s) or machine_late_s[index] > after / 1e9 + _NEAR_S:
-            own += 1
-    return total, own
+def late_steps(step_ns: Sequence[int], explains: Callable[[float, float], bool]) -> tuple[int, int]:
+    """Late steps, and how many of them the machine does not explain."""
+    late = [(a / 1e9, b / 1e9) for a, b in itertools.pairwise(step_ns) if b - a > _LATE_PERIODS * _PERIOD_S * 1e9]
+    return len(late), sum(not explains(before_s, after_s) for before_s, after_s in late)
 
 
 def resident_kb(child: Child) -> int:
@@ -156,7 +175,6 @@ def drive(minutes: float, folder: Path) -> tuple[dict[str, list[int]], Witness, 
     turns = int(minutes * 2) + 2
     rows = [f"{30.0 * i:.1f},{5.0 if i % 2 else 15.0}" for i in range(1, 2 * turns)]
     files.atomic_write(cycle, ("time_s,speed_mps\n0.0,0.0\n" + "\n".join(rows) + "\n").encode())
-    witness = Witness()
     memory: dict[str, list[int]] = {}
     with Children(environment(folder), folder) as children:
         bag, result = folder / "bag", folder / "drive.npz"
@@ -181,6 +199,7 @@ def drive(minutes: float, folder: Path) -> tuple[dict[str, list[int]], Witness, 
                 },
             ),
         )
+        witness = Witness(manager.process.pid)
         witness.start()
         watched = {"recorder": recorder, "power manager": manager, "simulator": simulator}
         while simulator.running:
@@ -216,9 +235,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"memory of the {name:14} {memory[name][-1] / 1024:7.1f} MB, growth {percent:+.1f} %")
         if percent > chosen.growth:
             problems.append(f"the {name} grew by {percent:.1f} %")
-    late, own = late_steps(recorded.step_ns, witness.late_s)
+    late, own = late_steps(recorded.step_ns, witness.explains)
     steps = len(recorded.step_ns)
-    print(f"{steps} steps; {late} late, {own} of them when the machine was not; it was {len(witness.late_s)} times")
+    print(f"{steps} steps; {late} late, {own} of them by itself; the machine was late {len(witness.late_s)} times")
     print(f"{recorded.degraded} steps in another mode than normal")
     if own:
         problems.append(f"{own} late steps that the machine does not explain")

@@ -117,7 +117,16 @@ class TestSoak:
 
     def test_a_late_step_is_the_machines_when_that_was_late_too(self) -> None:
         stamps = [ms * 1_000_000 for ms in range(0, 2000, 10) if ms not in (30, 1500)]
-        assert soak.late_steps(stamps, []) == (2, 2)
-        assert soak.late_steps(stamps, [0.03]) == (2, 1)
-        assert soak.late_steps(stamps, [0.03, 1.45]) == (2, 0)
-        assert soak.late_steps(stamps, [0.9]) == (2, 2)
+        witness = soak.Witness(0)
+        assert soak.late_steps(stamps, witness.explains) == (2, 2)
+        for late, own in (([0.9], 2), ([0.03], 1), ([0.03, 1.45], 0)):
+            witness.late_s = late
+            assert soak.late_steps(stamps, witness.explains) == (2, own)
+
+    def test_a_late_step_is_the_machines_when_it_let_the_process_wait(self) -> None:
+        stamps = [ms * 1_000_000 for ms in range(0, 2000, 10) if ms not in (30, 1500)]
+        witness = soak.Witness(0)
+        witness.times_s = [ms / 1000 for ms in range(0, 2000, 10)]
+        # Kept waiting for 8 ms around 1.5 s, and for 1 ms around 0.03 s: the first step was late by itself.
+        witness.waited_s = [(0.001 if t > 0.03 else 0.0) + (0.008 if t > 1.495 else 0.0) for t in witness.times_s]
+        assert soak.late_steps(stamps, witness.explains) == (2, 1)
