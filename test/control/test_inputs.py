@@ -29,6 +29,11 @@ NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 SECOND_NS = 1_000_000_000
 
 
+def test_every_reason_has_a_code_of_its_own() -> None:
+    assert [violation.value for violation in Violation] == list(range(12))
+    assert [verdict.value for verdict in WheelVerdict] == list(range(8))
+
+
 class TestValues:
     @pytest.mark.parametrize("value", [NAN, math.inf, -math.inf])
     def test_what_is_not_finite_is_refused(self, value: float) -> None:

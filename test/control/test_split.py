@@ -114,6 +114,12 @@ def test_the_table_is_read_multilinearly_and_its_edge_holds_outside(power, speed
         assert table_share(*point, table) == pytest.approx(known, abs=1e-9)
 
 
+@pytest.mark.parametrize(("power", "speed"), [(60e3, 10.0), (60e3, 0.0), (-60e3, 10.0), (-60e3, 30.0)])
+def test_where_no_share_delivers_more_the_share_stays(power, speed):
+    # On ice both axles give all they can, whatever the share.
+    assert cheapest_share(power, speed, 0.37, 0.1, True, 0.0, CAR, TABLE) == 0.37
+
+
 def test_a_share_from_a_table_stays_within_0_and_1():
     off = TABLE._replace(front_share=TABLE.front_share * 0.0 + 1.0 + 1e-9)
     assert table_share(1000.0, 10.0, 0.0, 0.0, 0.5, off) == 1.0
@@ -178,3 +184,8 @@ def test_the_preview_plays_its_schedule_and_holds_the_last_entry():
 def test_without_a_demand_the_split_stays_as_it_is(strategy, power):
     assert choose(strategy, power) == 0.3
     assert choose("equal", power) == 0.5
+
+
+def test_a_watt_is_a_demand():
+    assert choose("rule", 1.0) == 1.0
+    assert choose("rule", -1.0) == 1.0
