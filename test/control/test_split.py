@@ -117,7 +117,7 @@ def test_the_table_is_read_multilinearly_and_its_edge_holds_outside(power, speed
 @pytest.mark.parametrize(("power", "speed"), [(60e3, 10.0), (60e3, 0.0), (-60e3, 10.0), (-60e3, 30.0)])
 def test_where_no_share_delivers_more_the_share_stays(power, speed):
     # On ice both axles give all they can, whatever the share.
-    assert cheapest_share(power, speed, 0.37, 0.1, True, 0.0, CAR, TABLE) == 0.37
+    assert cheapest_share(power, speed, 0.37, 0.1, True, 0.0, CARS[0], TABLE) == 0.37
 
 
 def test_a_share_from_a_table_stays_within_0_and_1():
