@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +26,7 @@ from ..bags.replay import Replay, ReplayOutput, ReplayReport, exceeds
 from ..bags.what_if import Consumption, strategy_name, what_if
 from ..bags.writer import BagWriter, WriterOptions
 from ..control.types import STRATEGIES
-from ..errors import ConfigError, IwmError
+from ..errors import BagError, ConfigError, IwmError
 from ..files import atomic_write, check_number
 from ..share import resolve
 
@@ -138,6 +139,13 @@ def _replay(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace)
             for message, steps in replay.steps(progress):
                 if output is not None:
                     output.write(message, steps)
+        if not replay.report().steps:
+            raise BagError(f"{bag.path}: gave no control step: speed, wheel speeds and demand never came together")
+    except IwmError:
+        if writer is not None:  # what there is of it is of no use, and would be in the way of the next attempt
+            writer.abandon()
+            shutil.rmtree(writer.path, ignore_errors=True)
+        raise
     finally:
         if writer is not None:
             writer.close()
@@ -150,8 +158,6 @@ def _replay(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace)
     if options.compare:
         lines += _comparison_lines(report)
     _show(lines, result, options)
-    if not report.steps:
-        raise ConfigError(bag.path, "", "gave no control step: speed, wheel speeds and demand never came together")
     return DIFFERENT if options.compare and exceeds(report.comparison, options.tolerance) else DONE
 
 

@@ -344,6 +344,32 @@ def test_a_bag_without_wheel_speeds_or_steps_says_so(tmp_path: Path, capsys: pyt
     assert "maps to wheel_speed" in capsys.readouterr().err
 
 
+def test_a_replay_that_fails_leaves_nothing_in_the_way(drive: Path, tmp_path: Path) -> None:
+    arguments = [str(drive), "--output", str(tmp_path / "out")]
+    assert main([*arguments, "--strategy", "sdp", "--policy", "/none.npz"]) == BAD_INPUT
+    assert not (tmp_path / "out").exists()
+    assert main([*arguments, "--output", str(drive)]) == BAD_INPUT  # what is not ours stays
+    assert (drive / "metadata.yaml").exists()
+    assert main(arguments) == DONE
+
+
+def test_a_bag_whose_inputs_never_come_together_gives_no_step(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from bags_helpers import JointStateEncoder
+
+    with BagWriter(tmp_path / "bag") as bag:
+        speed, demand = bag.add_topic(topic("/vehicle_speed", TWIST)), bag.add_topic(topic("/power_demand"))
+        wheels = bag.add_topic(topic("/wheel_states", "sensor_msgs/msg/JointState"))
+        encode = JointStateEncoder(("front_left", "front_right", "rear_left", "rear_right"), "velocity")
+        bag.write(wheels, 1, encode(1, (1.0, 1.0, 1.0, 1.0)))
+        bag.write(speed, 2, twist(2, 1.0))
+        bag.write(demand, 3, float64(1.0))
+    assert main([str(tmp_path / "bag"), "--strategy", "equal", "--output", str(tmp_path / "out")]) == BAD_INPUT
+    assert "gave no control step" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_plan_comes_from_the_options_else_from_the_bag_else_from_the_package() -> None:
     parameters = {"strategy": "rule", "rule": [1.0, 0.25, 0.0, 0.5], "friction": 0.4, "critical_slip": 0.1,
                   "gate_mode": "table2", "rate_hz": 50.0, "idle_drive": "none"}  # fmt: skip
