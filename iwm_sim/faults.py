@@ -49,6 +49,9 @@ _MARGIN_S = 0.15
 #: A steady climb: torque is needed all the time.
 _SPEED_MPS, _GRADE, _LENGTH_S = 12.0, 0.03, 4000.0
 
+#: A load of ordinary priority, whatever the campaign itself runs at.
+_BUSY = "import os\nos.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\nwhile True: pass"
+
 #: What has to happen: torque to zero, no effect at all, or anything inside the limits (with a reason in the table).
 ZERO, RIDE, LIMITS = "zero torque", "rides through", "within limits"
 
@@ -179,7 +182,7 @@ class Session:
     def load_processors(self) -> None:
         """Two busy processes for each processor."""
         for _ in range(2 * (os.cpu_count() or 1)):
-            self._extra.append(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
+            self._extra.append(subprocess.Popen([sys.executable, "-c", _BUSY]))
 
     def relieve(self) -> None:
         """Undo `intrude` and `load_processors`."""

@@ -1,9 +1,9 @@
 """`python -m iwm_sim.soak`: half an hour in real time at 100 Hz; memory, deadlines and counts.
 
-Simulator, power manager and recorder run as in a car. Meanwhile this process samples the memory of each, keeps a deadline
-of its own at the same rate with nothing to do, and asks the kernel how long the power manager was ready to run and was
-not let: where the power manager is late and one of the two says so, it was the machine. At the end the bag has to hold
-exactly what each topic's publisher says it published.
+Simulator, power manager and recorder run as in a car. Meanwhile this process samples the memory of each, keeps a
+deadline of its own at the same rate with nothing to do, and asks the kernel how long the power manager was ready to run
+and was not let: where the power manager is late and one of the two says so, it was the machine. At the end the bag has
+to hold exactly what each topic's publisher says it published.
 """
 
 from __future__ import annotations
