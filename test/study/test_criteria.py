@@ -59,11 +59,19 @@ def test_a_rival_may_be_better_by_five_hundredths(ours, met):
     assert (not missed) == met
 
 
-def test_the_slip_aware_rival_counts_only_where_it_changes_the_share_as_often():
-    worse = cell(ours=2.0, bound=2.1)
-    assert any(RIVAL in text for text in unmet(worse))
-    calmer = cell(ours=2.0, bound=2.1, share_changes_per_min=5.1)
-    assert not any(RIVAL in text for text in unmet(calmer))
+def of_slip_aware(rows):
+    return next(made for made in criteria.check(rows, [STOP], 20000.0) if criteria.INSTANTANEOUS_SLIP in made.text)
+
+
+def test_the_slip_aware_rival_is_taken_at_as_many_changes_along_its_price():
+    calm = row(f"{criteria.INSTANTANEOUS_SLIP} 100 W", 1.2, share_changes_per_min=3.0)
+    between = [*cell(ours=1.8, share_changes_per_min=4.0), calm]  # halfway from (3, 1.2) to (5, 2.2): 1.7
+    assert of_slip_aware(between).value.startswith("+0.10 points")
+    fewest = [*cell(ours=1.0, share_changes_per_min=2.0), calm]
+    assert of_slip_aware(fewest).value.startswith("-0.20 points")
+    assert not of_slip_aware(fewest).met
+    most = [*cell(ours=2.3, share_changes_per_min=9.0), calm]
+    assert of_slip_aware(most).value.startswith("+0.10 points")
 
 
 def test_ninety_percent_of_a_large_possible_saving_have_to_be_taken():
