@@ -443,13 +443,15 @@ class PowerManager(LifecycleNode):
         It also wakes the executor often enough for a signal to be noticed.
         """
         controller = self._controller
+        stepping = self._active and not self._lockstep
         if self._active and controller:
             if self._lockstep:
                 self._take_friction(self._now_ns())
                 self._collect_sets()
             self._choose_friction()
             standing_s = time.monotonic() - self._last_step_steady_s
-            if not self._lockstep and standing_s > self._values["clock_stopped_s"]:
+            if stepping and standing_s > self._values["clock_stopped_s"]:
+                stepping = False
                 self._fault = "the clock stands still"
                 self._start_over()
                 self._command_zero()
@@ -458,10 +460,14 @@ class PowerManager(LifecycleNode):
         shown = controller and (controller.supervision.mode, controller.supervision.stale, controller.wheels_lost)
         gate = controller and controller.command and controller.command.gate
         if self._changes.changed((self._active, self._fault, shown, gate), time.monotonic()):
-            self._publish_report()
+            self._report_soon(stepping)
 
     def _on_report_timer(self) -> None:
-        if self._active and not self._lockstep:
+        self._report_soon(self._active and not self._lockstep)
+
+    def _report_soon(self, stepping: bool) -> None:
+        """Report at once, or, while there are control steps at a rate, right after the next one."""
+        if stepping:
             self._report_due = True
         else:
             self._publish_report()

@@ -50,64 +50,70 @@ def to_message(stamp_ns: int, node_name: str, statuses: Sequence[Status]) -> Dia
 
 
 @dataclass
+class _Window:
+    """What was measured since the last report; times in s."""
+
+    steps: int = 0
+    execution_sum_s: float = 0.0
+    execution_max_s: float = 0.0
+    periods: int = 0
+    period_sum_s: float = 0.0
+    period_min_s: float = math.inf
+    period_max_s: float = 0.0
+
+
 class LoopStatistics:
-    """Periods and execution times since the last report.
+    """Periods and execution times of the control loop.
 
     Attributes
     ----------
-    steps : steps since the node became active
+    steps : steps counted so far
     """
 
-    steps: int = 0
-    _count: int = 0
-    _periods: int = 0
-    _period_sum_s: float = 0.0
-    _period_max_s: float = 0.0
-    _period_min_s: float = math.inf
-    _execution_sum_s: float = 0.0
-    _execution_max_s: float = 0.0
+    def __init__(self) -> None:
+        self.steps = 0
+        self._window = _Window()
 
     def add(self, period_s: float | None, execution_s: float) -> None:
         """Count a step; `period_s` is None where there is no previous step."""
+        window = self._window
         self.steps += 1
-        self._count += 1
-        self._execution_sum_s += execution_s
-        self._execution_max_s = max(self._execution_max_s, execution_s)
+        window.steps += 1
+        window.execution_sum_s += execution_s
+        window.execution_max_s = max(window.execution_max_s, execution_s)
         if period_s is not None:
-            self._periods += 1
-            self._period_sum_s += period_s
-            self._period_max_s = max(self._period_max_s, period_s)
-            self._period_min_s = min(self._period_min_s, period_s)
+            window.periods += 1
+            window.period_sum_s += period_s
+            window.period_min_s = min(window.period_min_s, period_s)
+            window.period_max_s = max(window.period_max_s, period_s)
 
     def report(self, rate_hz: float | None, limits: Mapping[str, float]) -> Status:
-        """State of the control loop since the last call, judged as ros2_control does; starts counting anew.
+        """State of the control loop since the last call, judged as ros2_control does; starts measuring anew.
 
         Parameters
         ----------
         rate_hz : the rate that was asked for; None in lock-step, where there is none
         limits : execution_warn_us, execution_error_us, periodicity_warn_hz, periodicity_error_hz
         """
+        window, self._window = self._window, _Window()
         problems: list[tuple[int, str]] = []
-        values = {"steps": str(self.steps), "steps since the last report": str(self._count)}
-        if self._count:
-            mean_us = self._execution_sum_s / self._count * 1e6
+        values = {"steps": str(self.steps), "steps since the last report": str(window.steps)}
+        if window.steps:
+            mean_us = window.execution_sum_s / window.steps * 1e6
             values["execution time, mean (us)"] = f"{mean_us:.0f}"
-            values["execution time, max (us)"] = f"{self._execution_max_s * 1e6:.0f}"
+            values["execution time, max (us)"] = f"{window.execution_max_s * 1e6:.0f}"
             problems += _beyond(mean_us, limits, "execution", "us", "mean execution time")
-        if self._periods and self._period_sum_s > 0.0:
-            mean_hz = self._periods / self._period_sum_s
+        if window.period_sum_s > 0.0:
+            mean_hz = window.periods / window.period_sum_s
             values["rate, mean (Hz)"] = f"{mean_hz:.2f}"
-            values["period, min (ms)"] = f"{self._period_min_s * 1e3:.3f}"
-            values["period, max (ms)"] = f"{self._period_max_s * 1e3:.3f}"
+            values["period, min (ms)"] = f"{window.period_min_s * 1e3:.3f}"
+            values["period, max (ms)"] = f"{window.period_max_s * 1e3:.3f}"
             if rate_hz is not None:
                 problems += _beyond(
                     abs(mean_hz - rate_hz), limits, "periodicity", "hz", f"deviation from {rate_hz:g} Hz"
                 )
         elif rate_hz is not None:
             problems.append((ERROR, "no step since the last report"))
-        steps = self.steps
-        self.__init__()  # type: ignore[misc]
-        self.steps = steps
         level, message = _worst(problems)
         return Status("control loop", level, message, values)
 
