@@ -146,7 +146,7 @@ class Session:
         """Start the node under test."""
         parameters = {
             "strategy": self._plan.strategy,
-            "policy_file": self.policy if self.policy.exists() else "",
+            "policy_file": self.policy,
             "missed_periods": self._plan.missed_periods,
             "use_sim_time": self._sim_time,
         }
@@ -198,6 +198,10 @@ class Session:
         """Overwrite every policy file with something that is none."""
         for file in self.policy.glob("*.npz"):
             file.write_bytes(b"this is no policy")
+
+    def restore_policy(self) -> None:
+        """Bring the shipped policies back."""
+        copy_policies(self.policy)
 
 
 class Plan(NamedTuple):
@@ -275,7 +279,8 @@ def system_cases() -> Iterator[Case]:
                remark="friction brakes let go as slowly as docs/safety.md says")  # fmt: skip
     yield Case("second publisher of commands", LIMITS, Session.intrude, Session.relieve,
                remark="reported; the motor controllers must not listen to it")  # fmt: skip
-    yield Case("policy file overwritten", RIDE, Session.swap_policy, remark="reported; the loaded policy stays")
+    yield Case("policy file overwritten", RIDE, Session.swap_policy, Session.restore_policy,
+               remark="reported; the loaded policy stays")  # fmt: skip
     yield Case("both processors loaded", LIMITS, Session.load_processors, Session.relieve,
                remark="what the machine's scheduler leaves")  # fmt: skip
     yield Case("simulator killed", ZERO, lambda s: s.simulator.process.kill(), _restart_simulator)
@@ -376,13 +381,16 @@ def _tells(report: str) -> bool:
     return report.startswith(("inputs:", "command topics:", "policy:", "fault:"))
 
 
+def copy_policies(folder: Path) -> None:
+    """Put the shipped policies into a folder where they may be spoilt."""
+    shutil.copytree(resolve("policies"), folder, dirs_exist_ok=True)
+
+
 @contextmanager
 def session_of(folder: Path, sim_time: bool, plan: Plan) -> Iterator[Session]:
     """A simulated car under way, on a DDS domain of its own."""
     folder.mkdir(parents=True, exist_ok=True)
-    policies = resolve("policies")
-    if plan.strategy != "equal" and policies.is_dir():
-        shutil.copytree(policies, folder / "policies", dirs_exist_ok=True)
+    copy_policies(folder / "policies")
     domain = random.randrange(1, 102)
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(domain),
@@ -428,7 +436,7 @@ HEADER = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the campaign; exit code 1 if a fault did what it must not do."""
     parser = argparse.ArgumentParser(prog="faults", description=__doc__)
-    parser.add_argument("--strategy", default="equal", choices=config.BY_NAME["strategy"].choices)
+    parser.add_argument("--strategy", default="sdp", choices=config.BY_NAME["strategy"].choices)
     parser.add_argument(
         "--missed-periods",
         type=int,
