@@ -227,6 +227,7 @@ def _table_6(content: Content) -> Iterator[TableOf]:
         ("rms_jerk_mps3", "jerk", "m/s³", 1),
     ):
         columns += [Column(f"{key} {kind}", f"{label} {names[kind]}", unit, decimals) for kind in labels]
+    columns.append(Column("trace", "trace"))
     for idle_drive, meaning in _IDLE_DRIVES.items():
         rows = []
         for by in by_cell.values():
@@ -234,10 +235,11 @@ def _table_6(content: Content) -> Iterator[TableOf]:
             if first["idle_drive"] == idle_drive:
                 row = {"cycle": first["cycle"], "friction": first["friction"]}
                 for kind, label in labels.items():
-                    for column in columns[2:]:
+                    for column in columns[2:-1]:
                         key, _, of = column.key.partition(" ")
                         if of == kind:
                             row[column.key] = by[label][key]
+                row["trace"] = _traces(by[label] for label in labels.values())
                 rows.append(row)
         rows.sort(key=lambda row: (-row["friction"], row["cycle"]))
         yield TableOf(

@@ -399,7 +399,11 @@ def _content(
             "cells": rows,
             "gates": gate_rows,
             "stops": list(stops),
-            "frontier": {"cycle": FRONTIER_CYCLE, "friction": FRONTIER_FRICTION, "rows": frontier},
+            "frontier": {
+                "cycle": cases.cycle_of(plan.frontier[0].cycle).name,
+                "friction": plan.frontier[0].friction,
+                "rows": frontier,
+            },
             "robustness": robustness,
             "battery_fit": battery.numbers(),
             "sensitivity": _sensitivity(vehicle),
