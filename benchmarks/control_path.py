@@ -1,0 +1,10 @@
+"""Time from inputs to command over DDS beside a bare rclpy relay, and the period's jitter beside a bare timer's."""
+
+from __future__ import annotations
+
+import sys
+
+from iwm_sim.latency import main
+
+if __name__ == "__main__":
+    sys.exit(main())
