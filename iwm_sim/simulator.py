@@ -15,7 +15,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import rclpy
 from rclpy.clock import Clock, ClockType
@@ -415,14 +415,24 @@ class Simulator(Node):
         self.done.set_exception(error)
 
 
-def _interrupted(_number: int, _frame: Any) -> NoReturn:
-    raise KeyboardInterrupt
+class _Interruption:
+    """Handler of SIGINT and SIGTERM: ends a start at once, and a drive between two callbacks, never inside one."""
+
+    def __init__(self) -> None:
+        self.driving = False
+        self.requested = False
+
+    def __call__(self, _number: int, _frame: Any) -> None:
+        self.requested = True
+        if not self.driving:
+            raise KeyboardInterrupt
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Drive the cycle; returns the exit code: 0 at its end or on Ctrl-C, 1 with one line on an error."""
+    interruption = _Interruption()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _interrupted)
+        signal.signal(number, interruption)
     try:
         check_parameter_files(sys.argv if args is None else list(args))
         check_arguments("simulator", "A driver and a car on a drive cycle, seen through topics.", PARAMETERS, args)
@@ -431,8 +441,13 @@ def main(args: Sequence[str] | None = None) -> int:
         node = Simulator()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        executor.spin_until_future_complete(node.done)
-        node.done.result()
+        interruption.driving = True
+        # The node's timers wake the executor often enough for a signal to be noticed.
+        while not node.done.done() and not interruption.requested:
+            executor.spin_once()
+        if node.done.done():
+            node.done.result()
+        executor.shutdown()
         node.destroy_node()
     except KeyboardInterrupt:
         pass

@@ -201,7 +201,7 @@ def alive(process: int) -> bool:
 
 
 def until(condition: Any, what: str) -> Any:
-    end = time.monotonic() + 120.0
+    end = time.monotonic() + 240.0
     while not (found := condition()):
         assert time.monotonic() < end, f"waited in vain for {what}"
         time.sleep(0.05)
