@@ -161,7 +161,7 @@ class TestWheels:
             ((), NAMES, Violation.LENGTH),
             ((1.0, 2.0, 3.0, 4.0), ("front_left", "front_left", "rear_left", "rear_right"), Violation.NAME_TWICE),
             ((), (), Violation.AXLE_LOST),
-            ((math.nan, math.nan, 3.0, 4.0), NAMES, Violation.AXLE_LOST),
+            ((math.nan, math.nan, 20.0, 20.0), NAMES, Violation.AXLE_LOST),
             ((1.0, 2.0), ("front_left", "front_right"), Violation.AXLE_LOST),
         ],
     )
@@ -171,6 +171,12 @@ class TestWheels:
         assert monitor.wheel_speed_radps == (20.0,) * 4
         assert monitor.tallies[WHEELS].accepted_ns == NOW
         assert monitor.tallies[WHEELS].violation is violation
+
+    def test_the_first_message_has_no_time_behind_it(self) -> None:
+        limits = LIMITS._replace(wheels=LIMITS.wheels._replace(stray_s=0.5))
+        monitor = InputMonitor(NAMES, limits)
+        assert monitor.take_wheels(wheels(NOW, (60.0, 20.0, 20.0, 20.0)), NOW)
+        assert monitor.verdicts == (WheelVerdict.GOOD,) * 4
 
     def test_a_bad_stamp_is_seen_before_anything_else(self, monitor) -> None:
         assert not monitor.take_wheels(wheels(NOW - 101 * MS, (), NAMES), NOW)
