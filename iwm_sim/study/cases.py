@@ -80,7 +80,6 @@ class Case:
     policy : policy file; "" if the strategy needs none
     rule : coefficients of strategy `rule`
     switching_cost_j, switching_fixed_cost_j : of strategy `preview`
-    switching_price : factor on the policy's price of a change, at run time
     dt_s, substeps : control step, plant steps in it
     soc : at the start
     assumed_friction : what the law is told; None is the truth
@@ -101,7 +100,6 @@ class Case:
     rule: tuple[float, ...] = ()
     switching_cost_j: float = 0.0
     switching_fixed_cost_j: float = 0.0
-    switching_price: float = 1.0
     dt_s: float = 0.01
     substeps: int = 1
     soc: float = 0.8
@@ -199,11 +197,7 @@ def result(case: Case) -> Result:
 def _policy_table(case: Case, vehicle: Vehicle, until_s: float) -> PolicyTable:
     if case.strategy in POLICY_STRATEGIES:
         policy_of(case.policy).check_vehicle(vehicle, case.policy)
-        table = _table_of(case.policy)
-        return table._replace(
-            switching_cost_j=case.switching_price * table.switching_cost_j,
-            switching_fixed_cost_j=case.switching_price * table.switching_fixed_cost_j,
-        )
+        return _table_of(case.policy)
     if case.strategy == "rule":
         return empty_table(rule=case.rule)
     if case.strategy == "preview":

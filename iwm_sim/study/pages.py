@@ -329,7 +329,7 @@ def _frontier(content: Content) -> TableOf:
         columns,
         [row for row in frontier["rows"] if row["family"] != criteria.ED],
         "The price of instantaneous_slip is the power a change has to save; that of preview and ours is a cost per "
-        "change. Ours: the shipped policy with its price multiplied at run time.",
+        "change. Ours: solved anew for each price.",
     )
 
 
@@ -491,8 +491,8 @@ def drawn(content: Content, material: Material, vehicle: VehicleParams) -> list[
         Drawn(
             "figure_12_convergence",
             "Figure 12: policy iteration",
-            "The paper's problem, friction 0.9: change of the policy in each iteration, and the proven distance from "
-            "the optimal cost-to-go.",
+            "The paper's problem, friction 0.9: change of the policy in each iteration, and the Bellman residual, "
+            "which bounds the distance from the optimal cost-to-go.",
             figures.policy_convergence(*material.convergence),
         ),
         Drawn(

@@ -22,6 +22,7 @@ from iwm_power_manager import __version__
 from iwm_power_manager.control.types import GATE_MODES, default_settings
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
+from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
 from iwm_power_manager.policy import Policy
 from iwm_power_manager.vehicle import Vehicle, pack_energy_wh
 from iwm_sim.study import battery_fit, cases, criteria, pages, paper, sensitivity, skid
@@ -118,7 +119,8 @@ def study(
     """
     started = time.perf_counter()
     try:
-        (output / "figures").mkdir(parents=True, exist_ok=True)
+        for folder in ("figures", "grids"):
+            (output / folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(output, "", f"cannot be created: {error.strerror}", "a folder") from None
     say = _silent if quiet else _say
@@ -127,11 +129,12 @@ def study(
         grid: {key: solved(_car(vehicle, key[0]), key[1], grid, say) for key in ours}
         for grid in (PAPER_GRID, PAPER_GRID_WITHOUT)
     }
+    priced = _priced(vehicle, ours[IDLE_DRIVES[0], FRONTIER_FRICTION], output, say)
     warm_up(_warming(vehicle, cycles[0], ours), say)
 
     with tqdm(total=1, unit="run", file=sys.stderr, disable=quiet, leave=False) as bar:
         rules = _rules(vehicle, ours, jobs)
-        plan = _plan(vehicle, cycles, ours, paper_policies, rules)
+        plan = _plan(vehicle, cycles, ours, paper_policies, rules, priced)
         tasks: list[Callable[[], Any]] = [functools.partial(cases.result, case) for case in _all(plan)]
         stops = _stops(vehicle, ours)
         tasks += [functools.partial(battery_fit.fit, vehicle, IDLE_DRIVES[0], _fit_cycles(cycles))]
@@ -181,6 +184,25 @@ def _our_policies(vehicle: str, policy: str, say: Callable[[str], None]) -> dict
     }
 
 
+def _priced(vehicle: str, policy: str, output: Path, say: Callable[[str], None]) -> dict[float, str]:
+    """Our policy solved for other prices of a change, by price in J; the problems go to `output`."""
+    problem = cases.policy_of(policy).problem
+    made = {}
+    for factor in FRONTIER_FACTORS:
+        price = factor * max(problem.switching_fixed_cost_j, problem.switching_cost_j)
+        settings = problem.settings() | {
+            "format": PROBLEM_FORMAT,
+            "switching_cost_j": factor * problem.switching_cost_j,
+            "switching_fixed_cost_j": factor * problem.switching_fixed_cost_j,
+        }
+        del settings["name"]
+        grid = output / "grids" / f"price_{price:g}_j.yaml"  # JSON is YAML
+        atomic_write(grid, json.dumps(settings).encode())
+        at_hand = factor == 1.0
+        made[price] = policy if at_hand else solved(_car(vehicle, IDLE_DRIVES[0]), FRONTIER_FRICTION, str(grid), say)
+    return made
+
+
 def _warming(vehicle: str, cycle: str, ours: Mapping[tuple[str, float], str]) -> list[Case]:
     idle_drive, friction = next(iter(ours))
     base = Case(cycle, vehicle, idle_drive, friction, "equal")
@@ -210,6 +232,7 @@ def _plan(
     ours: Mapping[tuple[str, float], str],
     paper_policies: Mapping[str, Mapping[tuple[str, float], str]],
     rules: Mapping[tuple[str, float], Rule],
+    priced: Mapping[float, str],
 ) -> _Plan:
     plan = _Plan([], [], [], [])
     by_length = sorted(cycles, key=lambda cycle: -cases.cycle_of(cycle).duration_s)
@@ -224,7 +247,7 @@ def _plan(
                 _gates(base, paper_policies[PAPER_GRID][key], paper_policies[PAPER_GRID_WITHOUT][key], keep)
             )
     base = Case(_among(FRONTIER_CYCLE, cycles), vehicle, IDLE_DRIVES[0], FRONTIER_FRICTION, "equal")
-    plan.frontier.extend(_frontier(base, ours[IDLE_DRIVES[0], FRONTIER_FRICTION]))
+    plan.frontier.extend(_frontier(base, priced))
     for idle_drive in IDLE_DRIVES:
         for cycle in {_among(name, cycles): None for name in ROBUSTNESS_CYCLES}:
             base = Case(cycle, vehicle, idle_drive, 0.9, "equal")
@@ -300,7 +323,7 @@ def _gates(base: Case, paper_policy: str, without: str, keep: tuple[str, ...]) -
     ]
 
 
-def _frontier(base: Case, policy: str) -> list[Case]:
+def _frontier(base: Case, priced: Mapping[float, str]) -> list[Case]:
     """Saving against share changes: what the price of a change does, for each strategy that has one."""
     rival = [
         replace(
@@ -316,8 +339,7 @@ def _frontier(base: Case, policy: str) -> list[Case]:
         for cost in FRONTIER_COSTS_J
     ]
     ours = [
-        replace(base, strategy=STRATEGY, label=f"ours|{factor:g} x", policy=policy, switching_price=factor)
-        for factor in FRONTIER_FACTORS
+        replace(base, strategy=STRATEGY, label=f"ours|{price:g} J", policy=policy) for price, policy in priced.items()
     ]
     return [replace(base, label="ED|"), *rival, *bound, *ours]
 
@@ -486,9 +508,11 @@ def _sensitivity(vehicle: str) -> dict[str, Any]:
 
 
 def _convergence(policy: Policy) -> tuple[FloatArray, FloatArray]:
+    """Change of the policy, and the Bellman residual (half its span), in each iteration."""
     change = np.array([iteration.policy_change for iteration in policy.iterations])
     bound = np.array([iteration.bound_j for iteration in policy.iterations])
-    return change, bound
+    discount = policy.problem.discount
+    return change, bound * (1.0 - discount) / discount
 
 
 def _window(results: Sequence[Result]) -> dict[str, dict[str, FloatArray]]:
