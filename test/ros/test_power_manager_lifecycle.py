@@ -144,6 +144,17 @@ def test_shut_down_while_active_it_commands_zero(start_pair) -> None:
     assert pair.running.stop() == 0
 
 
+def test_shut_down_before_it_is_active_it_is_finalized_and_commands_nothing(start_pair) -> None:
+    pair = start_pair({"autostart": False})
+    bench = pair.bench
+    assert bench.change_state("configure")
+    assert bench.change_state("shutdown_inactive")
+    assert bench.lifecycle_state() == "finalized"
+    assert not bench.change_state("configure")
+    assert bench.torques == []
+    assert pair.running.stop() == 0
+
+
 @pytest.mark.parametrize("sig", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_with_zero_torque_and_exit_code_0(start_pair, sig) -> None:
     pair = start_pair()

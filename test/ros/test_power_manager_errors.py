@@ -1,0 +1,97 @@
+"""Errors nobody expects lead to a defined state: zero torque, and the node says why."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from sensor_msgs.msg import JointState
+
+from iwm_power_manager.control.controller import ControlFaultError
+from iwm_power_manager.nodes.power_manager import PowerManager
+from iwm_power_manager.ros import messages, qos
+
+
+@pytest.fixture(scope="module")
+def ros(compiled_law):
+    parameters = ("autostart:=false", "strategy:=equal", "policy_file:=''")
+    remaps = ("__ns:=/errors", "/diagnostics:=/errors/diagnostics")
+    args = ["--ros-args", *(part for p in parameters for part in ("-p", p)), *(x for r in remaps for x in ("-r", r))]
+    rclpy.init(args=args)
+    yield
+    rclpy.shutdown()
+
+
+@pytest.fixture
+def node(ros):
+    node = PowerManager()
+    yield node
+    node.stop()
+    node.destroy_node()
+
+
+@pytest.fixture
+def executor(node):
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    yield executor
+    executor.shutdown()
+
+
+def faults(node) -> list[str]:
+    return [status.message for status in node._own_statuses() if status.name == "fault"]
+
+
+def test_an_error_while_configuring_leads_to_unconfigured_and_can_be_overcome(node, monkeypatch) -> None:
+    def broken() -> None:
+        raise RuntimeError("out of luck")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(node, "_build", broken)
+        assert node.trigger_configure() == TransitionCallbackReturn.ERROR
+        assert node._lifecycle_state() == "unconfigured"
+        assert node.count_publishers(messages.WHEEL_TORQUE_COMMAND) == 0
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    assert node._lifecycle_state() == "inactive"
+    assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+
+
+def test_a_fault_of_the_law_ends_in_zero_torque_and_inactive(node, executor, monkeypatch) -> None:
+    received: list[JointState] = []
+    node.create_subscription(JointState, messages.WHEEL_TORQUE_COMMAND, received.append, qos.profile(lockstep=True))
+    assert node.start()
+
+    def until(condition, what) -> None:
+        end = time.monotonic() + 60.0
+        while not condition():
+            assert time.monotonic() < end, what
+            executor.spin_once(timeout_sec=0.1)
+
+    until(lambda: received, "a command")
+
+    def broken(*_args) -> None:
+        raise ControlFaultError("torque of wheel 0 is not finite")
+
+    monkeypatch.setattr(node._controller, "step", broken)
+    until(lambda: node._lifecycle_state() == "inactive", "inactive")
+    assert faults(node) == ["torque of wheel 0 is not finite"]
+    # What was under way arrives; after that there is nothing more.
+    counts = []
+    for _ in range(2):
+        for _ in range(20):
+            executor.spin_once(timeout_sec=0.02)
+        counts.append(len(received))
+    assert counts[0] == counts[1]
+    assert list(received[-1].effort) == [0.0] * 4
+
+
+def test_any_other_error_while_active_ends_there_too(node) -> None:
+    assert node.start()
+    node.fail("KeyError: 'x'")
+    assert node._lifecycle_state() == "inactive"
+    assert faults(node) == ["KeyError: 'x'"]
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    assert faults(node) == []
