@@ -51,6 +51,7 @@ class PlayOptions(NamedTuple):
     start_s, end_s : part of the bag, from its begin; None for its end
     loop : begin again at the end
     topics : those to play; () for all but commands and reports
+    listeners : begin when each topic has so many; 0: when somebody listens and no more listeners appear
     """
 
     rate: float = 1.0
@@ -59,6 +60,7 @@ class PlayOptions(NamedTuple):
     end_s: float | None = None
     loop: bool = False
     topics: tuple[str, ...] = ()
+    listeners: int = 0
 
 
 def play(bag: BagReader, options: PlayOptions) -> int:
@@ -97,7 +99,12 @@ class _Player:
         self._late_s = 0.0
 
     def wait_for_listeners(self) -> None:
-        """Wait until somebody listens and no more listeners appear."""
+        """Wait for the listeners that were asked for, else until somebody listens and no more listeners appear."""
+        wanted = self._options.listeners
+        while wanted and not self._stop.wait(0.02):
+            if all(publisher.get_subscription_count() >= wanted for publisher in self._publishers.values()):
+                self._stop.wait(_SETTLE_S)
+                return
         deadline = time.monotonic() + _PATIENCE_S
         count, since = -1, time.monotonic()
         while time.monotonic() < deadline and not self._stop.wait(0.02):

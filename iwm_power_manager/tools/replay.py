@@ -101,6 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     play.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds into the bag to begin at")
     play.add_argument("--end", type=float, metavar="S", help="seconds into the bag to end at")
     play.add_argument("--loop", action="store_true", help="begin again at the end")
+    play.add_argument("--listeners", type=int, default=0, metavar="N", help="begin when each topic has so many")
     play.add_argument("--topics", nargs="+", metavar="TOPIC", help="publish these only; default: all but the commands")
     return parser
 
@@ -115,6 +116,7 @@ def _check(options: argparse.Namespace) -> None:
     check_number("arguments", "--tolerance", options.tolerance, 0.0)
     check_number("arguments", "--rate", options.rate, 0.001, 1000.0)
     check_number("arguments", "--start", options.start, 0.0)
+    check_number("arguments", "--listeners", options.listeners, 0, 1000)
     if options.end is not None:
         check_number("arguments", "--end", options.end, options.start, above=True)
     if options.friction is not None:
@@ -191,7 +193,13 @@ def _publish(options: argparse.Namespace) -> int:
         return play(
             bag,
             PlayOptions(
-                options.rate, options.step, options.start, options.end, options.loop, tuple(options.topics or ())
+                options.rate,
+                options.step,
+                options.start,
+                options.end,
+                options.loop,
+                tuple(options.topics or ()),
+                options.listeners,
             ),
         )
 

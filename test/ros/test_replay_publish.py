@@ -78,7 +78,7 @@ def played_to_the_node(
         "-p", "wait_for:=[power_manager/state]",
     )  # fmt: skip
     until_says(recorder, "ready")  # the node is active by then, its law compiled
-    player = start("tools.replay", str(inputs), "--publish", "--rate", "1.0")
+    player = start("tools.replay", str(inputs), "--publish", "--rate", "1.0", "--listeners", "2")
     out, _ = end(player, None)
     assert f"{4 * COUNT} messages of 4 topics published" in out
     end(recorder)
@@ -134,7 +134,7 @@ def test_a_recording_of_the_real_time_node_replays_exactly(
 
 def test_start_end_and_steps_choose_what_is_played(tmp_path: Path, start: Callable[..., subprocess.Popen[str]]) -> None:
     inputs = ScriptedDrive("equal").write(tmp_path / "inputs", 100, state=False, commands=False)
-    arguments = ("--start", "0.2", "--end", "0.6", "--topics", "vehicle_speed")
+    arguments = ("--start", "0.2", "--end", "0.6", "--topics", "vehicle_speed", "--listeners", "1")
     recorder = start(
         "nodes.recorder", "--ros-args", "-p", f"output:={tmp_path / 'played'}", "-p", "topics:=[/vehicle_speed,/clock]",
     )  # fmt: skip
