@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from ..control import law
+from ..control import law, lockstep
 from ..control.controller import ControlFaultError, Controller, ControllerLimits
 from ..control.guard import violated_bound
 from ..control.inputs import ValueLimits, WheelLimits
@@ -26,7 +26,6 @@ from ..control.record import SIGNAL_NAMES, from_numbers
 from ..control.supervision import SupervisionLimits
 from ..control.types import Command, ControllerState, initial_state
 from ..model.pedals import pedal_power_w
-from ..ros import lockstep
 from .joint_state import NamedValues
 from .plan import WHEEL_NAMES, Plan
 from .signals import SignalValue

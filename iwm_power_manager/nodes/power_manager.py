@@ -28,6 +28,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
 from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
+from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.nodes import power_manager_config as config
@@ -36,7 +37,6 @@ from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerMa
 from iwm_power_manager.ros import diagnostics, messages, qos, realtime
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
-from iwm_power_manager.ros.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare, unknown
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iwm_power_manager.ros.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
+from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
 
 
 def push_set(queue: LockstepQueue, stamp: int, sent: int, *, without: tuple[int | str, ...] = ()) -> None:
