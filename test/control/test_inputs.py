@@ -284,7 +284,17 @@ class TestStuckWheels:
         assert follow(moving + standing).verdicts == (GOOD,) * 4
 
 
+def test_whether_the_car_drives_is_judged_by_its_speed_over_the_radius() -> None:
+    wheels = (-2.1, 2.4, 2.4, 2.4)
+    assert judge_wheels(wheels, 2.4, 0.01, NEW_WHEELS, WHEELS, 0.4).verdicts[0] is GOOD  # 1 m/s is 2.5 rad/s here
+    assert judge_wheels(wheels, 2.6, 0.01, NEW_WHEELS, WHEELS, 0.4).verdicts[0] is WheelVerdict.OPPOSITE
+
+
 class TestStrayedWheels:
+    def test_of_two_wheels_equally_far_from_the_car_neither_has_strayed(self) -> None:
+        steps = [((42.0, 18.0, 30.0, 30.0), 30.0)] * 40
+        assert follow(steps).verdicts == (GOOD,) * 4
+
     def test_a_wheel_far_from_partner_and_car_for_long_is_lost(self) -> None:
         steps = [((42.0 + 0.001 * i, 30.0, 30.0, 30.0), 30.0) for i in range(33)]
         assert follow(steps).verdicts == (WheelVerdict.STRAYED, GOOD, GOOD, GOOD)

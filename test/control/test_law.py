@@ -474,6 +474,18 @@ def test_a_gate_cuts_at_once_and_the_way_back_is_slew_limited():
 # --- Limits, one by one ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("dt", "period", "taken"), [(0.01, 0.02, [0, 2, 4, 6, 8]), (0.01, 0.05, [0, 5]), (0.1, 0.02, range(10))]
+)
+def test_the_split_is_decided_once_a_period(dt, period, taken):
+    s, state, steps = DEFAULT._replace(strategy=t.PREVIEW, decision_period_s=period), initial_state(), []
+    for k in range(10):
+        before, state = state, take(measurement(dt=dt), state, s).after
+        if state.decisions > before.decisions:
+            steps.append(k)
+    assert steps == list(taken)
+
+
 def test_equal_split_at_ease_gives_each_motor_a_quarter():
     case = settle(measurement(demand=6000.0))
     assert case.command.motor_torque_nm == pytest.approx((6000.0 / 4.0 / (15.0 / RADIUS),) * 4)

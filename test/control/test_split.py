@@ -147,6 +147,11 @@ def test_the_lookahead_stays_where_changing_gains_nothing():
     assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, CAR, free) in SHARES
 
 
+def test_the_lookahead_does_not_change_for_less_than_rounding():
+    twins = TABLE._replace(share=np.array([0.3 - 1e-9, 0.3 + 1e-9]), switching_cost_j=0.0, switching_fixed_cost_j=0.0)
+    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, CAR, twins) == 0.3
+
+
 def choose(strategy, power=5000.0, decisions=0, previous=0.3, speed=12.0, friction=0.9):
     s = default_settings(strategy)
     return decide(power, speed, 0.01, -0.02, previous, friction, decisions, s, CAR, TABLE)
