@@ -12,7 +12,6 @@ import itertools
 import json
 import math
 import os
-import random
 import shutil
 import subprocess
 import sys
@@ -34,6 +33,7 @@ from iwm_power_manager.ros import messages as m
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import fault_relay as relay
+from iwm_sim.domains import claimed_domain
 from iwm_sim.fault_relay import FaultRelay
 from iwm_sim.processes import Child, Children
 
@@ -391,26 +391,22 @@ def session_of(folder: Path, sim_time: bool, plan: Plan) -> Iterator[Session]:
     """A simulated car under way, on a DDS domain of its own."""
     folder.mkdir(parents=True, exist_ok=True)
     copy_policies(folder / "policies")
-    domain = random.randrange(1, 102)
-    environment = os.environ | {
-        "ROS_DOMAIN_ID": str(domain),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_LOG_DIR": str(folder / "ros"),
-    }
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=domain, args=[])
-    node = FaultRelay(context, _NAMESPACE)
-    try:
-        with Children(environment, folder) as children:
-            session = Session(folder, children, node, sim_time, plan)
-            try:
-                yield session
-            finally:
-                session.relieve()
-    finally:
-        node.close()
-        rclpy.shutdown(context=context)
+    with claimed_domain() as domain:
+        environment = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(folder / "ros")}
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=domain, args=[])
+        node = FaultRelay(context, _NAMESPACE)
+        try:
+            with Children(environment, folder) as children:
+                session = Session(folder, children, node, sim_time, plan)
+                try:
+                    yield session
+                finally:
+                    session.relieve()
+        finally:
+            node.close()
+            rclpy.shutdown(context=context)
 
 
 def show(result: Result) -> str:

@@ -12,11 +12,10 @@ import argparse
 import json
 import math
 import os
-import random
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from iwm_power_manager.errors import IwmError
 from iwm_power_manager.ros import messages as m
 from iwm_power_manager.ros import qos
 from iwm_power_manager.ros.intake import Intake
+from iwm_sim.domains import claimed_domain
 from iwm_sim.processes import Children
 
 _SPEED_MPS, _RADIUS_M = 10.0, 0.33
@@ -186,18 +186,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.relay:
         relay_main(chosen.relay)
         return 0
-    domain = random.randrange(1, 102)
-    with tempfile.TemporaryDirectory(prefix="iwm-latency-") as folder:
-        environment = os.environ | {
-            "ROS_DOMAIN_ID": str(domain),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-            "ROS_LOG_DIR": folder,
-        }
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        os.environ["ROS_LOG_DIR"] = folder
+    with tempfile.TemporaryDirectory(prefix="iwm-latency-") as folder, claimed_domain() as domain:
+        own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": folder}
+        os.environ |= own
         rclpy.init(args=[], domain_id=domain)
         try:
-            return _run(chosen, environment, Path(folder))
+            return _run(chosen, os.environ | {"ROS_DOMAIN_ID": str(domain)}, Path(folder))
         except IwmError as error:
             print(f"latency: {error}", file=sys.stderr)
             return 1
@@ -205,7 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rclpy.shutdown()
 
 
-def _run(chosen: argparse.Namespace, environment: dict[str, str], folder: Path) -> int:
+def _run(chosen: argparse.Namespace, environment: Mapping[str, str], folder: Path) -> int:
     node = Node("questioner", enable_rosout=False, start_parameter_services=False)
     manager = [sys.executable, "-m", "iwm_power_manager.nodes.power_manager", "--ros-args"]
     manager += ["-p", f"strategy:={chosen.strategy}", "-p", f"policy_file:='{chosen.policy}'"]

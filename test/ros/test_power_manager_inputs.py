@@ -13,11 +13,13 @@ from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.ros import messages, qos
 
 NAN = math.nan
+#: A busy machine may keep a message for a while: a test of its content must not fail for its age.
+OLDEST_S = 5.0
 
 
 @pytest.fixture(scope="module")
 def bench(start_pair):
-    bench = start_pair({"rule": [0.0, 0.9, 0.0, 0.9]}).bench
+    bench = start_pair({"rule": [0.0, 0.9, 0.0, 0.9], "stamp_oldest_s": OLDEST_S}).bench
     bench.connect()
     return bench
 
@@ -75,7 +77,7 @@ def test_one_bad_message_is_dropped_and_counted_and_changes_nothing(bench, bad, 
 
 
 def test_a_stamp_from_the_future_or_from_long_ago_is_dropped(bench) -> None:
-    for offset_ns, key in ((10**9, "stamp in future"), (-(10**9), "stamp too old")):
+    for offset_ns, key in ((10**9, "stamp in future"), (-(10**10), "stamp too old")):
         before = counter(bench, f"vehicle_speed: dropped, {key}")
         send_alone(bench, stamp_ns=bench.stamp() + offset_ns)
         assert counter(bench, f"vehicle_speed: dropped, {key}") > before
@@ -226,11 +228,13 @@ class TestParameters:
         bench.drive(lambda: bench.last("front_share") == pytest.approx(0.9), "another split")
         assert bench.set_parameter("strategy", "equal") == ""
         bench.drive(lambda: bench.last("front_share") == 0.5, "the old split")
-        shares = [state["front_share"] for state in bench.states[start:]]
-        steps = [state["dt_s"] for state in bench.states[start + 1 :]]
+        states, stamps = bench.states[start:], bench.state_stamps[start:]
         fastest = bench.last("setting.share_rate_per_s")
-        assert all(abs(b - a) <= fastest * dt + 1e-9 for a, b, dt in zip(shares, shares[1:], steps, strict=False))
-        assert bench.set_parameter("friction", 0.9) == ""
+        # A slow reader of a queue of one misses states: what counts is the time between those that came.
+        for (before, after), (then, now) in zip(itertools.pairwise(states), itertools.pairwise(stamps), strict=True):
+            steps = after["step"] - before["step"]
+            longest_s = (now - then) / 1e9 + steps * 0.2 * 0.01  # a step counts for a fifth of the period at least
+            assert abs(after["front_share"] - before["front_share"]) <= fastest * longest_s + 1e-9
 
     def test_every_parameter_is_described(self, bench) -> None:
         friction = bench.describe("friction")
@@ -242,6 +246,7 @@ class TestParameters:
 
 
 def test_friction_may_come_from_its_topic_and_falls_back_when_that_is_stale(bench) -> None:
+    assert bench.set_parameter("friction", 0.9) == ""
     assert bench.set_parameter("friction_source", "road_friction") == ""
     assert bench.set_parameter("friction_timeout_s", 0.5) == ""
     sent = [0]
