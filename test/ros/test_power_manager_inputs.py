@@ -90,8 +90,10 @@ def test_a_missing_input_degrades_to_zero_torque_and_recovers(bench, without, bi
     start = len(bench.states)
     bench.drive(lambda: bench.last("motor_factor") == 0.0, "zero torque", without=(without,))
     degraded = [state for state in bench.states[start:] if state["mode"] == 2]
-    assert degraded
-    assert all(int(state["stale"]) & bit for state in degraded)
+    # A busy machine may hold up another input for a moment before this one is missed.
+    missed = list(itertools.dropwhile(lambda state: not int(state["stale"]) & bit, degraded))
+    assert missed
+    assert all(int(state["stale"]) & bit for state in missed)
     torques = [state["front_left_motor_torque_nm"] for state in degraded]
     assert all(b <= a + 1e-9 for a, b in itertools.pairwise(torques))
     bench.spin_until(lambda: bench.torques[-1].effort[0] == 0.0, "the last torque")
