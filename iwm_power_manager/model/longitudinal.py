@@ -73,7 +73,8 @@ def wheel_step(
     speed = wheel_speed_radps
     if high > 0.0:
         speed = min(max(speed, low), high)
-        for _ in range(60):
+        change = high - low
+        for _ in range(100):
             rim = radius * speed
             denominator = max(rim, speed_after_mps, tyre.slip_speed_floor_mps)
             slip = (rim - speed_after_mps) / denominator
@@ -86,11 +87,12 @@ def wheel_step(
             else:
                 low = speed
             next_speed = speed - residual / gradient if gradient > 0.0 else low - 1.0
-            if not low <= next_speed <= high:
+            # The tyre's S-shaped curve can send Newton to and fro: halve where the steps do not shrink.
+            if not low <= next_speed <= high or abs(next_speed - speed) > 0.5 * abs(change):
                 next_speed = 0.5 * (low + high)
-            step = next_speed - speed
+            change = next_speed - speed
             speed = next_speed
-            if abs(step) <= 1e-11 * (1.0 + abs(speed)):
+            if abs(change) <= 1e-11 * (1.0 + abs(speed)):
                 break
         if speed > 0.0:
             return speed, (torque - inertia_rate * (speed - wheel_speed_radps)) / radius, resisting_torque_nm

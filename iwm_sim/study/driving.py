@@ -63,12 +63,10 @@ def on_all_cores(
             made[index] = future.result()
             done(made[index])
     except BaseException:
-        processes = list((pool._processes or {}).values())
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
+        for process in list((pool._processes or {}).values()):
             process.terminate()
-        for process in processes:
-            process.join()
+        # The pool's own thread collects what was ended; a second collector would race with it.
+        pool.shutdown(wait=True, cancel_futures=True)
         raise
     pool.shutdown()
     return [made[index] for index in range(len(items))]
