@@ -178,3 +178,12 @@ def test_from_standstill_to_40_m_s_it_is_stable_and_exact_at_any_step(dt):
     assert distance == pytest.approx(0.5 * force / mass * seconds**2, rel=5e-3)
     assert worst < 1.0
     assert wheels[0] * RADIUS == pytest.approx(speed, rel=0.05)
+
+
+def test_a_wheel_driven_across_the_steep_part_of_the_tyre_s_curve_is_solved():
+    # Braking slip before, driving torque beyond the grip: plain Newton goes to and fro between the curve's two ends.
+    wheels = tuple(wheel_speed_at_slip(s, 1.0, RADIUS) for s in (0.0, -0.125, 0.0, 0.0))
+    motors = (0.0, 129.0, 0.0, 0.0)
+    friction = (0.9, 0.2, 0.9, 0.9)
+    motion = step(1.0, wheels, 0.0, motors, (0.0,) * 4, 0.0, friction, 0.005, CAR)
+    assert max(map(abs, residuals(1.0, wheels, motion, motors, 0.0, friction, 0.005))) < 1e-4
