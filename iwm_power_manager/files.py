@@ -42,6 +42,15 @@ def sha256_of(path: Path | str) -> str:
     return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
+def content_sha256(path: Path | str) -> str:
+    """SHA-256 of a file's bytes; of a folder, over the names and hashes of the files in it."""
+    path = Path(path)
+    if not path.is_dir():
+        return sha256_of(path)
+    files = sorted(file for file in path.iterdir() if file.is_file())
+    return hashlib.sha256("".join(f"{file.name} {sha256_of(file)}\n" for file in files).encode()).hexdigest()
+
+
 def atomic_write(path: Path | str, data: bytes) -> None:
     """Write `data` so that a reader sees the old file or the whole new one, even after a power cut.
 

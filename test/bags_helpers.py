@@ -21,13 +21,14 @@ from iwm_power_manager.control.monitor import BatteryReading, JointReading, Spee
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.control.supervision import SupervisionLimits
 from iwm_power_manager.control.types import default_settings
-from iwm_power_manager.policy import empty_table
+from iwm_power_manager.policy import choose, empty_table, load_policy_bank
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 
 FLOAT64 = "std_msgs/msg/Float64"
 TWIST = "geometry_msgs/msg/TwistStamped"
 BATTERY = "sensor_msgs/msg/BatteryState"
+FRICTION = 0.9
 
 
 def float64(value: float) -> bytes:
@@ -44,18 +45,27 @@ class ScriptedDrive:
     """A drive written into a bag by the same `Controller` the node has: inputs, commands and state, as in lock-step.
 
     The car is no model: speed follows a smooth script, with some slip, driving and braking.
+
+    Parameters
+    ----------
+    strategy : of the law
+    policy_file : file or folder of policies, for strategies that need one
     """
 
     DT_NS = 10_000_000
 
-    def __init__(self, strategy: str = "instantaneous_slip") -> None:
+    def __init__(self, strategy: str = "instantaneous_slip", policy_file: Path | None = None) -> None:
         self.vehicle = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"))
         # No price for a change of the share: so that the strategy does something in a second.
-        self.parameters = {"strategy": strategy, "switching_power_w": 0.0}
+        self.parameters: dict[str, str | float] = {"strategy": strategy, "switching_power_w": 0.0}
         self.settings = default_settings(strategy)._replace(switching_power_w=0.0)
         supervision = SupervisionLimits(0.3, 2.0, 0.5, 0.5)
         limits = ControllerLimits(steps.INPUT_LIMITS._replace(radius_m=0.33), None, supervision)
-        self.controller = Controller(self.vehicle.params, WHEEL_NAMES, limits, self.settings, empty_table(), 0.9)
+        table = empty_table()
+        if policy_file is not None:
+            self.parameters["policy_file"] = str(policy_file)
+            table = choose(load_policy_bank(policy_file, self.vehicle), FRICTION).table()
+        self.controller = Controller(self.vehicle.params, WHEEL_NAMES, limits, self.settings, table, FRICTION)
 
     def inputs(self, i: int) -> tuple[float, list[float], float]:
         """Speed, wheel speeds and demand of step `i`."""
@@ -65,11 +75,20 @@ class ScriptedDrive:
         slip = 0.002 * demand / 1e3
         return speed, [speed / 0.33 * (1.0 + slip * k) for k in (1.0, 1.1, 0.9, 1.0)], demand
 
-    def write(self, path: Path, count: int, *, state: bool = True, commands: bool = True, start: int = 0) -> Path:
+    def write(
+        self,
+        path: Path,
+        count: int,
+        *,
+        state: bool = True,
+        commands: bool = True,
+        start: int = 0,
+        **custom_data: str,
+    ) -> Path:
         """Drive `count` steps from step `start` on, starting the controller anew."""
         wheel_states = JointStateEncoder(WHEEL_NAMES, "velocity")
         torque, numbers = JointStateEncoder(WHEEL_NAMES, "effort"), JointStateEncoder(SIGNAL_NAMES, "position")
-        custom_data = {"parameters /power_manager": json.dumps(self.parameters)}
+        custom_data["parameters /power_manager"] = json.dumps(self.parameters)
         with BagWriter(path, custom_data=custom_data) as bag:
             speed_topic = bag.add_topic(topic("/vehicle_speed", TWIST))
             wheel_topic = bag.add_topic(topic("/wheel_states", JOINT_STATE))

@@ -23,6 +23,15 @@ def test_a_write_replaces_the_file_and_leaves_nothing_else(tmp_path):
     assert files.sha256_of(path) == hashlib.sha256(b"new").hexdigest()
 
 
+def test_the_hash_of_a_folder_changes_with_each_name_and_each_content_in_it(tmp_path):
+    hashes = set()
+    for name, content in (("a", b"1"), ("a", b"2"), ("b", b"2")):
+        (tmp_path / name).write_bytes(content)
+        hashes.add(files.content_sha256(tmp_path))
+    assert len(hashes) == 3
+    assert files.content_sha256(tmp_path / "b") == files.sha256_of(tmp_path / "b")
+
+
 def test_a_new_file_gets_what_the_umask_allows(tmp_path):
     before = os.umask(0o027)
     try:

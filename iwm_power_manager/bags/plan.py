@@ -17,7 +17,7 @@ from ..control.types import (
     default_settings,
 )
 from ..errors import ConfigError, PolicyError
-from ..files import check_number
+from ..files import check_number, content_sha256
 from ..policy import Policy, PolicyTable, choose, empty_table, load_policy_bank
 from ..share import resolve
 from ..vehicle import Vehicle, load_vehicle
@@ -88,6 +88,11 @@ class PolicyBank:
     def checksums(self) -> list[str]:
         """Identities of the policies loaded so far."""
         return [policy.checksum for policy in self._bank or []]
+
+    @property
+    def content_sha256(self) -> str:
+        """Hash of the file or folder, as a recorder takes it; "" if no step needed a policy."""
+        return content_sha256(resolve(self._path)) if self._bank else ""
 
     def _loaded(self) -> list[Policy]:
         if self._bank is None:

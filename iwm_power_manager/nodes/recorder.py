@@ -7,7 +7,6 @@ Three threads share the work: this module's main loop takes messages from DDS (`
 from __future__ import annotations
 
 import argparse
-import hashlib
 import math
 import re
 import signal
@@ -38,7 +37,7 @@ from ..bags.recording import FAILED, Recording, RecordingOptions, Sample
 from ..bags.recover import recover
 from ..bags.writer import WriterOptions
 from ..errors import BagError, IwmError
-from ..files import sha256_of
+from ..files import content_sha256
 from ..ros.messages import (
     CLOCK,
     FRICTION_BRAKE_COMMAND,
@@ -343,21 +342,13 @@ def _custom_data(values: Mapping[str, Any]) -> dict[str, str]:
         if values[f"{kind}_file"]:
             path = resolve(values[f"{kind}_file"])
             custom[f"{kind}_file"] = path.name
-            custom[f"{kind}_sha256"] = _content_hash(path)
+            custom[f"{kind}_sha256"] = content_sha256(path)
     for pair in filter(None, values["metadata"]):
         key, _, value = pair.partition("=")
         if not (key and value):
             raise ParameterError(f"parameter metadata: {pair!r} is not allowed; allowed: key=value")
         custom[key] = value
     return custom
-
-
-def _content_hash(path: Path) -> str:
-    """SHA-256 of a file; of a folder of policies, over the names and hashes of its files."""
-    if not path.is_dir():
-        return sha256_of(path)
-    files = sorted(file for file in path.iterdir() if file.is_file())
-    return hashlib.sha256("".join(f"{file.name} {sha256_of(file)}\n" for file in files).encode()).hexdigest()
 
 
 def _spin(executor: SingleThreadedExecutor) -> None:

@@ -158,6 +158,8 @@ def _replay(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace)
     if writer is not None:
         lines.append(f"written: {writer.path}, {writer.message_count} messages")
     if options.compare:
+        if result["other_policy"]:
+            lines.append("  the policy is not the one that was recorded: its file or folder has another SHA-256")
         lines += _comparison_lines(report)
     _show(lines, result, options)
     return DIFFERENT if options.compare and exceeds(report.comparison, options.tolerance) else DONE
@@ -222,11 +224,18 @@ def _result(bag: BagReader, plan: Plan, report: ReplayReport) -> dict[str, Any]:
         "vehicle": plan.vehicle.name,
         "vehicle_hash": plan.vehicle.hash,
         "policies": plan.policies.checksums,
+        "other_policy": _is_other_policy(bag, plan),
         **report._asdict(),
         "comparison": [
             {**topic._asdict(), "first": topic.first._asdict() if topic.first else None} for topic in report.comparison
         ],
     }
+
+
+def _is_other_policy(bag: BagReader, plan: Plan) -> bool:
+    """Whether the bag names a policy by its hash and this replay used another: its commands may agree by chance."""
+    recorded, used = bag.custom_data.get("policy_sha256", ""), plan.policies.content_sha256
+    return bool(recorded and used and recorded != used)
 
 
 def _report_lines(bag: BagReader, report: ReplayReport, elapsed_s: float) -> list[str]:

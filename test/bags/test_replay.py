@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -20,6 +21,9 @@ from iwm_power_manager.bags.replay import Replay
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.errors import ConfigError, PolicyError
+from iwm_power_manager.files import content_sha256
+from iwm_power_manager.policy import load_policy, save_policy
+from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.replay import BAD_INPUT, DIFFERENT, DONE, main
 
 COUNT = 150
@@ -76,8 +80,6 @@ def test_a_changed_gain_limit_or_strategy_is_caught(
 def test_a_changed_limit_of_the_vehicle_is_caught(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from iwm_power_manager.share import share_path
-
     text = share_path("config/vehicles/jalalmaab_2015.yaml").read_text()
     changed = tmp_path / "weaker.yaml"
     assert "regeneration_torque_nm" in text
@@ -89,6 +91,59 @@ def test_a_changed_limit_of_the_vehicle_is_caught(
     assert changed.read_text() != text
     assert main([str(drive), "--compare", "--vehicle", str(changed)]) == DIFFERENT
     assert "friction_brake_command" in capsys.readouterr().out
+
+
+POLICY = "jalalmaab_2015_drag_coupled_mu090.npz"
+
+
+def changed_policies(folder: Path) -> dict[str, list[str]]:
+    """Arguments for `replay` that stand for the recorded policy and for four others."""
+    policy = load_policy(share_path(f"policies/{POLICY}"))
+    nudged = dataclasses.replace(policy, front_share=np.clip(policy.front_share + 0.01, 0.0, 1.0))
+    save_policy(nudged, folder / "nudged.npz")
+    return {
+        "the same": [],
+        "the same file, copied": ["--policy", str(share_path(f"policies/{POLICY}"))],
+        "another friction": ["--friction", "0.2"],
+        "another file": ["--policy", str(share_path(f"policies/{POLICY}".replace("mu090", "mu050")))],
+        "a table 0.01 off": ["--policy", str(folder / "nudged.npz")],
+    }
+
+
+@pytest.mark.parametrize("state", [True, False], ids=["drive", "inputs"])
+def test_a_changed_policy_is_caught_and_the_same_one_matches(
+    state: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Long enough for the policies of friction 0.9 and 0.5, which are much alike, to disagree.
+    drive = ScriptedDrive("sdp", share_path("policies")).write(tmp_path / "drive", 2 * COUNT, state=state)
+    for name, arguments in changed_policies(tmp_path).items():
+        wanted = DONE if name.startswith("the same") else DIFFERENT
+        assert main([str(drive), "--compare", *arguments]) == wanted, name
+        text = capsys.readouterr().out
+        assert ("first at message" in text) == (wanted == DIFFERENT), name
+
+
+def test_a_policy_changed_in_its_place_is_caught(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "policy.npz"
+    policy = load_policy(share_path(f"policies/{POLICY}"))
+    save_policy(policy, file)
+    drive = ScriptedDrive("sdp", file).write(tmp_path / "drive", COUNT)
+    assert main([str(drive), "--compare"]) == DONE
+    save_policy(dataclasses.replace(policy, front_share=1.0 - policy.front_share), file)
+    assert main([str(drive), "--compare"]) == DIFFERENT
+    assert "first at message" in capsys.readouterr().out
+
+
+def test_another_policy_that_decides_the_same_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "policy.npz"
+    policy = load_policy(share_path(f"policies/{POLICY}"))
+    save_policy(policy, file)
+    drive = ScriptedDrive("sdp", file).write(tmp_path / "drive", 20, policy_sha256=content_sha256(file))
+    assert main([str(drive), "--compare"]) == DONE
+    assert "not the one that was recorded" not in capsys.readouterr().out
+    save_policy(dataclasses.replace(policy, package_version="0"), file)
+    assert main([str(drive), "--compare"]) == DONE
+    assert "the policy is not the one that was recorded" in capsys.readouterr().out
 
 
 def test_a_difference_within_the_tolerance_is_none(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
