@@ -31,6 +31,11 @@ class Unattended(CallbackGroup):
         """Nothing was begun."""
 
 
+def never_called(_message: Any) -> None:
+    """Callback of a subscription in an `Unattended` group."""
+    raise AssertionError("an executor served an unattended subscription")
+
+
 class Intake:
     """Unattended subscriptions of a node, by topic."""
 
@@ -44,7 +49,7 @@ class Intake:
         self._subscriptions[topic] = self._node.create_subscription(
             kind,
             topic,
-            _never_called,
+            never_called,
             profile,
             callback_group=self._group,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
@@ -80,7 +85,3 @@ class Intake:
         for subscription in self._subscriptions.values():
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
-
-
-def _never_called(_message: Any) -> None:
-    raise AssertionError("an executor served an unattended subscription")

@@ -17,12 +17,12 @@ from collections.abc import Iterable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
-from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ..bags.metadata import INFINITE_NS, Qos
+from .intake import Unattended, never_called
 
 #: One message as it was taken: topic number, received (ns), bytes, sent (ns), the publisher's counter.
 Taken = tuple[int, int, bytes, int, int]
@@ -36,19 +36,6 @@ _TURN = 5000
 
 #: What the middleware says while it has not heard of a publisher's node.
 _UNKNOWN_NODE_NAME = "_NODE_NAME_UNKNOWN_"
-
-
-class _Unattended(CallbackGroup):
-    """A group no executor ever serves."""
-
-    def can_execute(self, entity: Any) -> bool:
-        return False
-
-    def beginning_execution(self, entity: Any) -> bool:
-        return False
-
-    def ending_execution(self, entity: Any) -> None:
-        """Nothing was begun."""
 
 
 class FoundTopic(NamedTuple):
@@ -102,7 +89,7 @@ class RawSubscriptions:
         self._pattern = pattern
         self._depth = depth
         self.publishers: set[str] = set()
-        self._group = _Unattended()
+        self._group = Unattended()
         self._topics: dict[str, _Topic] = {}
         self._refused: dict[str, str] = {}
 
@@ -194,7 +181,7 @@ class RawSubscriptions:
         topic.subscription = self._node.create_subscription(
             topic.msg_class,
             topic.name,
-            _never_called,
+            never_called,
             QoSProfile(
                 history=HistoryPolicy.KEEP_LAST, depth=self._depth, reliability=request[0], durability=request[1]
             ),
@@ -204,10 +191,6 @@ class RawSubscriptions:
         topic.request = request
         if previous is not None:
             self._node.destroy_subscription(previous)
-
-
-def _never_called(_: bytes) -> None:
-    raise AssertionError("an executor served an unattended subscription")
 
 
 def _weakest(publishers: Sequence[TopicEndpointInfo], policy: str, strong: Any, weak: Any) -> Any:
