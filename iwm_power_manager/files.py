@@ -7,6 +7,7 @@ list, or into one `ConfigError` that says file, key, value and what is allowed.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import math
 import os
@@ -78,13 +79,28 @@ def atomic_write(path: Path | str, data: bytes) -> None:
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
-        folder = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        sync_folder(target.parent)
     except OSError as error:
         raise ConfigError(path, "", f"cannot be written: {error.strerror or error}") from None
+
+
+def sync_folder(path: Path) -> None:
+    """Have the disk take a folder's entries: before, a new or renamed file is not safe from a power cut.
+
+    Where that cannot be asked for (a folder that may be written but not read, a file system that does not know it),
+    nothing is done; any other trouble is an `OSError`.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        return
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:
+            raise
+    finally:
+        os.close(descriptor)
 
 
 class _StrictLoader(yaml.SafeLoader):

@@ -115,7 +115,7 @@ class McapFile:
         try:
             self._append(MAGIC + _record(HEADER, _text(PROFILE) + _text(library)))
         except OSError:
-            self._stream.close()
+            self.remove()
             raise
 
     @property
@@ -251,6 +251,11 @@ class McapFile:
     def abandon(self) -> None:
         """Close the file as it is; what is in it can be recovered."""
         self._stream.close()
+
+    def remove(self) -> None:
+        """Close the file and delete it."""
+        self._stream.close()
+        self.path.unlink(missing_ok=True)
 
     def _end(self) -> bytes:
         data_end = _record(DATA_END, _U32.pack(0))

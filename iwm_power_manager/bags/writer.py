@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 from .. import __version__
 from ..errors import BagError, ConfigError
-from ..files import atomic_write
+from ..files import atomic_write, sync_folder
 from .mcap_file import COMPRESSIONS, McapFile
 from .metadata import (
     CUSTOM_METADATA,
@@ -93,13 +94,19 @@ class BagWriter:
         self._file_has_message = False
         self._closed = False
         self._closed_bytes = 0
+        self._file: McapFile | None = None  # none once the bag is closed, or if the next file could not be opened
         try:
-            self.path.mkdir(parents=True)
+            _make_folder(self.path)
         except FileExistsError:
             raise BagError(f"{self.path}: exists already and is not overwritten; choose another name") from None
         except OSError as error:
             raise BagError(f"{self.path}: cannot be created: {error.strerror or error}") from None
-        self._file = self._open_file()
+        try:
+            self._open_file()
+        except BagError:
+            with suppress(OSError):
+                self.path.rmdir()  # it would be in the way of the next attempt
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -110,24 +117,24 @@ class BagWriter:
     @property
     def size_bytes(self) -> int:
         """What is on disk in all files of the bag."""
-        return self._closed_bytes + (0 if self._closed else self._file.size_bytes)
+        return self._closed_bytes + (self._file.size_bytes if self._file else 0)
 
     @property
     def message_count(self) -> int:
         """Messages on disk; those of the chunk in memory are not counted yet."""
-        return sum(span.message_count for span in self._spans) + (0 if self._closed else self._file.message_count)
+        return sum(span.message_count for span in self._spans) + (self._file.message_count if self._file else 0)
 
     @property
     def file_count(self) -> int:
         """Files of the bag so far."""
-        return len(self._spans) + (0 if self._closed else 1)
+        return len(self._spans) + (1 if self._file else 0)
 
     def add_topic(self, topic: Topic) -> int:
         """Announce a topic; returns the number that `write` takes."""
         self._topics.append(topic)
         self._counts.append(0)
         try:
-            self._channels.append(announce(self._file, topic))
+            self._channels.append(announce(self._open, topic))
         except OSError as error:
             raise self._failed(error) from None
         return len(self._topics) - 1
@@ -136,7 +143,7 @@ class BagWriter:
         """Add to the custom metadata, on disk at once."""
         self.custom_data.update(values)
         try:
-            self._file.add_metadata(CUSTOM_METADATA, dict(values))
+            self._open.add_metadata(CUSTOM_METADATA, dict(values))
         except OSError as error:
             raise self._failed(error) from None
 
@@ -159,17 +166,19 @@ class BagWriter:
                 f"{self.path}: {self._topics[topic].name}: a message of {len(data)} bytes was not written; "
                 f"allowed: <= {options.max_message_bytes}"
             )
+        file = self._open
         if not self._file_has_message:
             self._file_start_ns = log_time_ns
             self._file_has_message = True
         elif (options.max_duration_ns and log_time_ns - self._file_start_ns >= options.max_duration_ns) or (
-            options.max_bytes and self._file.size_bytes + self._file.pending_bytes + len(data) > options.max_bytes
+            options.max_bytes and file.size_bytes + file.pending_bytes + len(data) > options.max_bytes
         ):
             self.split()
+            file = self._open
             self._file_start_ns = log_time_ns
             self._file_has_message = True
         try:
-            self._file.write(
+            file.write(
                 self._channels[topic],
                 log_time_ns,
                 log_time_ns if publish_time_ns is None else publish_time_ns,
@@ -182,20 +191,20 @@ class BagWriter:
     def flush(self, sync: bool = False) -> None:
         """Bring everything given so far into the file; with `sync` onto the disk."""
         try:
-            self._file.flush(sync)
+            self._open.flush(sync)
         except OSError as error:
             raise self._failed(error) from None
 
     def duplicate_descriptor(self) -> int:
         """A descriptor of the current file, for whoever wants to wait for the disk; theirs to close."""
-        return self._file.duplicate_descriptor()
+        return self._open.duplicate_descriptor()
 
     def split(self) -> None:
         """Close the current file and begin the next."""
         if not self._file_has_message:
             return
-        self._finish_file()
-        self._file = self._open_file()
+        self._finish_file(self._open)
+        self._open_file()
 
     def close(self) -> None:
         """Close the file and write `metadata.yaml`. Closing twice does nothing."""
@@ -203,19 +212,29 @@ class BagWriter:
             return
         self._closed = True
         try:
-            self._finish_file()
+            if self._file is not None:
+                self._finish_file(self._file)
         finally:
             self._write_metadata()
 
     def abandon(self) -> None:
         """Close without index and metadata, as a crash would leave the bag (see `recover`)."""
         self._closed = True
-        self._file.abandon()
+        if self._file is not None:
+            self._file.abandon()
+            self._file = None
 
     def _file_name(self) -> str:
         return f"{self.path.name}_{len(self._spans)}.mcap"
 
-    def _open_file(self) -> McapFile:
+    @property
+    def _open(self) -> McapFile:
+        if self._file is None:
+            raise BagError(f"{self.path}: is closed, or its next file could not be created")
+        return self._file
+
+    def _open_file(self) -> None:
+        """Begin the next file; one that cannot take its definitions is removed again."""
         try:
             file = McapFile(
                 self.path / self._file_name(),
@@ -223,22 +242,27 @@ class BagWriter:
                 compression=self.options.compression,
                 chunk_bytes=self.options.chunk_bytes,
             )
-            if self.custom_data:
-                file.add_metadata(CUSTOM_METADATA, self.custom_data)
-            self._channels = [announce(file, topic) for topic in self._topics]
+            try:
+                sync_folder(self.path)
+                if self.custom_data:
+                    file.add_metadata(CUSTOM_METADATA, self.custom_data)
+                self._channels = [announce(file, topic) for topic in self._topics]
+            except OSError:
+                file.remove()
+                raise
         except OSError as error:
             raise self._failed(error) from None
+        self._file = file
         self._file_has_message = False
-        return file
 
-    def _finish_file(self) -> None:
-        file = self._file
+    def _finish_file(self, file: McapFile) -> None:
         try:
             finish(file, list(zip(self._topics, self._channels, strict=True)), self.custom_data)
         except OSError as error:
             file.abandon()
             raise self._failed(error) from None
         finally:
+            self._file = None
             for index, channel in enumerate(self._channels):
                 self._counts[index] += file.channel_counts.get(channel, 0)
             self._spans.append(span_of(file))
@@ -250,6 +274,14 @@ class BagWriter:
 
     def _failed(self, error: OSError) -> BagError:
         return BagError(f"{self.path}: cannot be written: {error.strerror or os.fspath(self.path)}")
+
+
+def _make_folder(path: Path) -> None:
+    """Create a folder, and those above it that are missing, so that they survive a power cut."""
+    missing = [folder for folder in path.parents if not folder.exists()]
+    path.mkdir(parents=True)
+    for folder in (path, *missing):
+        sync_folder(folder.parent)
 
 
 def announce(file: McapFile, topic: Topic) -> int:

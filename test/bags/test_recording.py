@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import errno
+import json
+import os
 import resource
 import shutil
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
 import pytest
 
 from bags_helpers import float64, topic
+from disk_helpers import on_small_disk, private_folder
 from iwm_power_manager.bags import recording as recording_module
 from iwm_power_manager.bags.mcap_file import McapFile
 from iwm_power_manager.bags.reader import BagReader
@@ -198,6 +203,125 @@ def test_a_full_disk_ends_the_recording_with_every_message_accounted_for(tmp_pat
         assert [message.publish_time_ns for message in reader.messages()] == list(range(status.written))
     recover(tmp_path / "bag")  # there was no room for an index
     assert values(tmp_path / "bag") == list(range(status.written))
+
+
+#: Records until the disk is full; then reads, recovers elsewhere, makes room, and records again. Says what happened.
+FULL_DISK_CHILD = """
+import json, sys
+from pathlib import Path
+import shutil
+from bags_helpers import float64, topic
+from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.bags.recording import Recording, RecordingOptions
+from iwm_power_manager.bags.recover import recover
+from iwm_power_manager.bags.writer import WriterOptions
+
+disk, elsewhere = Path(sys.argv[1]), Path(sys.argv[2])
+
+def values(path):
+    with BagReader(path) as reader:
+        return [message.publish_time_ns for message in reader.messages()]
+
+recording = Recording(
+    disk / "bag", RecordingOptions(WriterOptions("none", chunk_bytes=4096, max_bytes=int(sys.argv[3])), 0.01)
+)
+recording.start()
+recording.add_topic(topic("/a"))
+put = 0
+while not recording.failed.wait(0.0005):
+    recording.put([(0, i, float64(i), i, i + 1) for i in range(put, put + 100)])
+    put += 100
+status = recording._call(recording.status)  # behind all that was put
+read = values(disk / "bag")
+shutil.copytree(disk / "bag", elsewhere)
+recover(elsewhere)
+try:
+    recording.start()
+    refused = ""
+except Exception as error:
+    refused = str(error)
+shutil.rmtree(disk / "bag")
+again = recording.start()
+recording.put([(0, i, float64(i), i, i + 1) for i in range(5)])
+recording.close()
+print(json.dumps({"put": put, "status": status._asdict(), "read": read, "refused": refused, "again": values(again)}))
+"""
+
+
+@pytest.mark.parametrize("max_bytes", [0, 60_000], ids=["one file", "split files"])
+def test_on_a_disk_that_fills_up_all_that_was_written_stays_readable(tmp_path: Path, max_bytes: int) -> None:
+    disk, elsewhere = tmp_path / "disk", tmp_path / "copy"
+    disk.mkdir()
+    child = [sys.executable, "-c", FULL_DISK_CHILD, str(disk), str(elsewhere), str(max_bytes)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        on_small_disk(disk, "size=200k", child), capture_output=True, text=True, check=False, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    status = found["status"]
+    assert status["state"] == "failed"
+    assert status["error"] == f"{disk / 'bag'}: cannot be written: No space left on device"
+    assert found["read"] == list(range(status["written"]))
+    assert status["written"] > 500
+    assert status["written"] + status["dropped_error"] == found["put"]
+    assert values(elsewhere) == found["read"]
+    assert found["refused"] == f"{disk / 'bag_1'}: cannot be written: No space left on device"
+    assert found["again"] == list(range(5))
+
+
+def test_a_read_only_folder_fails_the_start_and_leaves_nothing(tmp_path: Path) -> None:
+    with private_folder() as folder:
+        folder.chmod(0o555)
+        recording = Recording(folder / "new" / "bag")
+        with pytest.raises(BagError, match="bag: cannot be created: Permission denied"):
+            recording.start()
+        assert list(folder.iterdir()) == []
+        folder.chmod(0o755)
+        assert recording.start() == folder / "new" / "bag"
+        recording.close()
+
+
+def test_a_folder_that_becomes_read_only_keeps_the_present_file_and_fails_at_the_next(tmp_path: Path) -> None:
+    with private_folder() as folder:
+        recording = Recording(folder / "bag", RecordingOptions(flush_period_s=0.01))
+        recording.start()
+        recording.add_topic(topic("/a"))
+        recording.put(samples(0, 10))
+        recording._call(lambda: None)
+        (folder / "bag").chmod(0o555)
+        recording.put(samples(10, 10))  # the open file takes them
+        with pytest.raises(BagError, match="bag: cannot be written: Permission denied"):
+            recording.split()
+        recording.put(samples(20, 7))
+        recording.close()
+        status = recording.status()
+        assert (status.state, status.written, status.dropped_error, status.files) == ("failed", 20, 7, 1)
+        assert "Permission denied" in status.error
+        with BagReader(folder / "bag") as reader:
+            assert [message.publish_time_ns for message in reader.messages()] == list(range(20))
+        (folder / "bag").chmod(0o755)
+        report = recover(folder / "bag")
+        assert (report.metadata_written, report.files[0].rebuilt) == (True, False)  # only its metadata was missing
+        assert values(folder / "bag") == list(range(20))
+
+
+def test_a_folder_that_is_read_only_at_the_end_costs_the_metadata_alone(tmp_path: Path) -> None:
+    with private_folder() as folder:
+        recording = Recording(folder / "bag")
+        recording.start()
+        recording.add_topic(topic("/a"))
+        recording.put(samples(0, 10))
+        recording._call(lambda: None)
+        (folder / "bag").chmod(0o555)
+        with pytest.raises(BagError, match=r"metadata\.yaml: cannot be written: Permission denied"):
+            recording.stop()
+        status = recording.status()
+        assert (status.state, status.written, status.dropped_error) == ("failed", 10, 0)
+        recording.close()
+        (folder / "bag").chmod(0o755)
+        recover(folder / "bag")
+        assert values(folder / "bag") == list(range(10))
 
 
 def test_after_a_failure_a_new_bag_can_be_started(tmp_path: Path) -> None:
