@@ -68,6 +68,7 @@ class RecordingStatus(NamedTuple):
     queue_bytes, queue_peak_bytes : memory the queue takes, and the most it took
     bytes_on_disk : of the current or last bag
     files : number of files of that bag
+    disk_behind_s : what is older than this is on the disk and survives a power cut; 0 when all is, or without `sync`
     error : why the recording failed, one line
     """
 
@@ -82,6 +83,7 @@ class RecordingStatus(NamedTuple):
     queue_peak_bytes: int
     bytes_on_disk: int
     files: int
+    disk_behind_s: float
     error: str
 
 
@@ -117,7 +119,7 @@ class Recording:
         self._writer: BagWriter | None = None
         self._given = 0  # messages given to the current bag
         self._written_before = 0  # messages in the bags before it
-        self._status = RecordingStatus(STOPPED, "", 0, 0, 0, 0, 0, 0, 0, 0, 0, "")
+        self._status = RecordingStatus(STOPPED, "", 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.0, "")
         self._starts = 0
         self._snapshots = 0
         self._memory: deque[Sample] = deque()
@@ -125,6 +127,7 @@ class Recording:
         self._last_flush = time.monotonic()
         self._disk = ThreadPoolExecutor(1, "disk")
         self._syncing: Future[None] | None = None
+        self._on_disk_until: float | None = None  # what was given before is on the disk; None while nothing is written
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
         self._thread.start()
@@ -219,7 +222,9 @@ class Recording:
     def status(self) -> RecordingStatus:
         """Counts and state now."""
         with self._wake:
+            until = self._on_disk_until
             return self._status._replace(
+                disk_behind_s=0.0 if until is None else time.monotonic() - until,
                 dropped_queue=self._dropped_queue,
                 pending=self._status.pending + self._queue_count,
                 queue_bytes=self._queue_bytes,
@@ -349,7 +354,17 @@ class Recording:
             self._syncing = None
             if error is not None:
                 raise BagError(f"{writer.path}: the disk reports an error: {error}")
-        self._syncing = self._disk.submit(_sync_and_close, writer.duplicate_descriptor())
+        self._syncing = self._disk.submit(self._sync_and_close, writer.duplicate_descriptor(), time.monotonic())
+
+    def _sync_and_close(self, descriptor: int, until: float) -> None:
+        """Run by the disk's thread: what was in the file at `until` is on the disk afterwards."""
+        try:
+            os.fdatasync(descriptor)
+        finally:
+            os.close(descriptor)
+        with self._wake:
+            if self._on_disk_until is not None:
+                self._on_disk_until = max(self._on_disk_until, until)
 
     def _fail(self, writer: BagWriter, error: BagError) -> None:
         with suppress(BagError):
@@ -361,6 +376,8 @@ class Recording:
 
     def _leave(self, writer: BagWriter, state: str) -> None:
         self._state = state
+        with self._wake:
+            self._on_disk_until = None
         self._publish()
         self._written_before += writer.message_count
         self._given = 0
@@ -389,6 +406,9 @@ class Recording:
         self._state = RECORDING
         self._error = ""
         self._last_flush = time.monotonic()
+        if self.options.sync:
+            with self._wake:
+                self._on_disk_until = self._last_flush
         return path
 
     def _recorded(self) -> BagWriter:
@@ -441,13 +461,6 @@ class Recording:
                 with suppress(MessageTooLarge):
                     bag.write(*sample)
         return path
-
-
-def _sync_and_close(descriptor: int) -> None:
-    try:
-        os.fdatasync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def _size(samples: Iterable[Sample]) -> int:

@@ -72,6 +72,8 @@ _DISCOVERY_FAST_S = 0.05
 _DISCOVERY_SLOW_S = 0.25
 #: The publisher learns of the match a little after the subscription does.
 _SETTLE_S = 0.5
+#: What a power cut may cost; a disk that takes longer is reported.
+_DISK_BEHIND_S = 1.0
 #: After the signal to end: taking goes on until nothing has come for the one, at most for the other.
 _FINAL_QUIET_S = 0.1
 _FINAL_WAIT_S = 2.0
@@ -290,6 +292,9 @@ class Recorder(Node):
             level, text = DiagnosticStatus.ERROR, status.error
         elif dropped or lost:
             level, text = DiagnosticStatus.WARN, f"{status.state}; {dropped} dropped, {lost} lost on the way"
+        elif status.disk_behind_s > _DISK_BEHIND_S:
+            level = DiagnosticStatus.WARN
+            text = f"{status.state}; the disk is slow: a power cut now would lose {status.disk_behind_s:.1f} s"
         elif self._use_sim_time and self._now_ns is None:
             level, text = DiagnosticStatus.WARN, f"{status.state}; waiting for {CLOCK}"
         else:
