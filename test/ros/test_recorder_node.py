@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -27,6 +28,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import Trigger
 
+from disk_helpers import on_small_disk
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.recover import recover
 
@@ -38,10 +40,12 @@ RELIABLE = QoSProfile(depth=1000)
 class RecorderProcess:
     """A recorder started like a user would, its output kept."""
 
-    def __init__(self, output: Path, *parameters: str, remaps: tuple[str, ...] = ()) -> None:
+    def __init__(self, output: Path, *parameters: str, remaps: tuple[str, ...] = (), disk: str = "") -> None:
         arguments = [f"-p {name}" for name in (f"output:={output}", *parameters)] + [f"-r {remap}" for remap in remaps]
+        command = [sys.executable, "-m", "iwm_power_manager.nodes.recorder"]
+        command += ["--ros-args", *" ".join(arguments).split()]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "iwm_power_manager.nodes.recorder", "--ros-args", *" ".join(arguments).split()],
+            on_small_disk(output.parent, disk, command) if disk else command,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -73,11 +77,11 @@ class Peer:
                 pytest.fail(f"{what}: did not happen within {PATIENCE_S:g} s")
             self.executor.spin_once(timeout_sec=0.05)
 
-    def until_ready(self, namespace: str = "") -> None:
+    def until_ready(self, namespace: str = "", name: str = "recorder") -> None:
         """Spin until the recorder says that it is ready."""
         heard: list[bool] = []
         listener = self.node.create_subscription(
-            Bool, f"{namespace}/recorder/ready", lambda message: heard.append(message.data), LATCHED
+            Bool, f"{namespace}/{name}/ready", lambda message: heard.append(message.data), LATCHED
         )
         self.until(lambda: bool(heard) and heard[-1], "recorder ready")
         self.node.destroy_subscription(listener)
@@ -108,8 +112,8 @@ def peer() -> Iterator[Peer]:
 def recorder() -> Iterator[Callable[..., RecorderProcess]]:
     started: list[RecorderProcess] = []
 
-    def start(output: Path, *parameters: str, remaps: tuple[str, ...] = ()) -> RecorderProcess:
-        started.append(RecorderProcess(output, *parameters, remaps=remaps))
+    def start(output: Path, *parameters: str, remaps: tuple[str, ...] = (), disk: str = "") -> RecorderProcess:
+        started.append(RecorderProcess(output, *parameters, remaps=remaps, disk=disk))
         return started[-1]
 
     yield start
@@ -357,6 +361,51 @@ def test_a_failing_disk_ends_the_node_with_one_line(
     assert "Traceback" not in error
 
 
+def test_on_a_full_disk_the_node_ends_with_one_line_or_stays_and_reports(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    parameters = ("topics:=[/numbers]", "wait_for:=[/numbers]", "compression:=none", "flush_period_s:=0.05")
+    ending = recorder(tmp_path / "bag", *parameters, disk="size=64k")
+    staying = recorder(
+        tmp_path / "bag", *parameters, "exit_on_error:=false", disk="size=64k", remaps=("__node:=stays",)
+    )
+    peer.until_ready()
+    peer.until_ready(name="stays")
+    reports: list[DiagnosticArray] = []
+    peer.node.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 10)
+
+    def both_have_failed() -> bool:
+        for _ in range(100):
+            numbers.publish(Float64(data=1.0))
+        failed = any(r.status[0].name == "stays: recording" and r.status[0].level == b"\x02" for r in reports)
+        return failed and ending.process.poll() is not None
+
+    peer.until(both_have_failed, "end of one recorder and error report of the other")
+    code, error = ending.end()
+    assert code == 1
+    line = f"{tmp_path / 'bag'}: cannot be written: No space left on device"
+    assert error.strip().splitlines()[-1].startswith(f"recorder: {line}; ")
+    assert line in {report.status[0].message for report in reports}
+    assert staying.process.poll() is None
+    # Its disk is its own, but Linux lets us look.
+    (file,) = Path(f"/proc/{staying.process.pid}/root{tmp_path}/bag").glob("*.mcap")
+    with BagReader(file) as reader:
+        assert sum(1 for _ in reader.messages()) > 500
+    code, error = staying.end()
+    assert code == 1
+    assert error.strip().splitlines()[-1].startswith(f"recorder: {line}; ")
+
+
+def test_into_a_read_only_folder_nothing_is_recorded_and_one_line_says_so(
+    tmp_path: Path, recorder: Callable[..., RecorderProcess]
+) -> None:
+    process = recorder(tmp_path / "bag", disk="ro,size=64k")
+    process.process.wait(PATIENCE_S)
+    code, error = process.end()
+    assert (code, error) == (1, f"recorder: {tmp_path / 'bag'}: cannot be created: Read-only file system\n")
+
+
 @pytest.mark.parametrize(
     ("parameter", "line"),
     [
@@ -399,52 +448,60 @@ def test_the_recover_command_needs_no_ros_and_says_what_was_lost(tmp_path: Path)
     assert done.stderr == f"recorder: {tmp_path / 'none'}: does not exist\n"
 
 
-def kill_while_publishing(
-    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess], run: int, delay_s: float
-) -> None:
-    """Kill the node at 1 kHz after `delay_s`, recover, compare with what was sent."""
-    path = tmp_path / f"bag{run}"
+def kill_while_publishing(path: Path, recorder: Callable[..., RecorderProcess], delay_s: float) -> float:
+    """Kill the node at 1 kHz after `delay_s`, recover, compare with what was sent; returns what was lost, in s."""
+    # A publisher that has seen a recorder die reaches the next one a second or more late (Fast DDS: a killed process
+    # says no goodbye): that is about the start of a recording, and this is about its end. So each has a new one.
+    peer = Peer()
     process = recorder(path, "topics:=[/numbers]", "wait_for:=[/numbers]")
     numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
-    peer.until_ready()
-    first_ns = time.time_ns()
-    killed: list[int] = []
+    try:
+        peer.until_ready()
+        first_ns = time.time_ns()
+        killed: list[int] = []
 
-    def kill() -> None:
-        process.process.kill()
-        killed.append(time.time_ns())
+        def kill() -> None:
+            process.process.kill()
+            killed.append(time.time_ns())
 
-    killer = threading.Timer(delay_s, kill)
-    killer.start()
-    count = 0
-    while process.process.poll() is None:
-        numbers.publish(Float64(data=float(count)))
-        count += 1
-        time.sleep(max(0.0, (first_ns + count * 1_000_000 - time.time_ns()) * 1e-9))
-    killer.join()
-    peer.node.destroy_publisher(numbers)
+        killer = threading.Timer(delay_s, kill)
+        killer.start()
+        count = 0
+        while process.process.poll() is None:
+            numbers.publish(Float64(data=float(count)))
+            count += 1
+            time.sleep(max(0.0, (first_ns + count * 1_000_000 - time.time_ns()) * 1e-9))
+        killer.join()
+    finally:
+        peer.close()
     report = recover(path)
     if report.files[0].message_count == 0:
-        assert delay_s < 1.0
-        return
-    with BagReader(path) as reader:
-        sequences = [m.sequence for m in reader.messages()]
-        assert reader.damage == []
-    # Under load, DDS may tell the publisher of its match later than the recorder thinks: the first few may be missing.
-    assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
-    assert killed[0] - report.end_ns < 1_000_000_000, f"lost {(killed[0] - report.end_ns) * 1e-9:.3f} s"
+        lost_s = (killed[0] - first_ns) * 1e-9
+    else:
+        lost_s = (killed[0] - report.end_ns) * 1e-9
+        with BagReader(path) as reader:
+            messages = list(reader.messages())
+            assert reader.damage == []
+        sequences = [message.sequence for message in messages]
+        # Under load, DDS may tell the publisher of its match later than the recorder: the first few may be missing.
+        assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+        assert [m.data for m in messages] == [serialize_message(Float64(data=float(n - 1))) for n in sequences]
+    assert lost_s < 1.0, f"killed after {delay_s:.3f} s: lost {lost_s:.3f} s"
+    return lost_s
 
 
 def test_killed_at_1_khz_the_node_loses_less_than_its_last_second(
-    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+    tmp_path: Path, recorder: Callable[..., RecorderProcess]
 ) -> None:
-    kill_while_publishing(tmp_path, peer, recorder, 0, 1.3)
+    kill_while_publishing(tmp_path / "bag", recorder, 1.3)
 
 
 @pytest.mark.nightly
 @pytest.mark.timeout(1800)
 def test_killed_fifty_times_at_1_khz_the_node_loses_less_than_its_last_second(
-    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+    tmp_path: Path, recorder: Callable[..., RecorderProcess], record_property: Callable[[str, object], None]
 ) -> None:
-    for run in range(50):
-        kill_while_publishing(tmp_path, peer, recorder, run, 0.05 + 0.05 * run)
+    draw = random.Random(20150602)
+    lost_s = [kill_while_publishing(tmp_path / f"bag{run}", recorder, draw.uniform(0.05, 2.5)) for run in range(50)]
+    record_property("largest_loss_s", max(lost_s))
+    print(f"largest loss of {len(lost_s)} kills: {max(lost_s):.3f} s")
