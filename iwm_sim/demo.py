@@ -11,7 +11,6 @@ import argparse
 import json
 import math
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -36,6 +35,7 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import IDLE_DRIVES, Vehicle, load_vehicle
 from iwm_sim import closed_loop, metrics
 from iwm_sim.closed_loop import Run
+from iwm_sim.domains import claimed_domain
 from iwm_sim.drive import CAR_COLUMNS, load_run
 from iwm_sim.drive_bag import problems, read_drive_bag, with_decisions
 from iwm_sim.processes import Child, ChildError, Children
@@ -43,8 +43,6 @@ from iwm_sim.study.drive_page import Driven, drive_page, row
 from iwm_sim.study.report import format_value as shown
 from iwm_sim.study.report import write_page
 
-#: Domains whose ports stay below those that Linux hands out to clients.
-_DOMAINS = range(1, 102)
 #: A node that has to compile first, on a busy machine, takes this long to be there.
 _PARTNER_TIMEOUT_S = 300.0
 #: What the simulator sends at its rate, which the power manager has to know to notice when it is missing.
@@ -287,10 +285,10 @@ def node_command(node: str, parameters: Mapping[str, Any]) -> list[str]:
     return command
 
 
-def environment(output: Path) -> dict[str, str]:
-    """Environment of the nodes: a DDS domain of their own, on this machine only, logs below the output."""
+def environment(output: Path, domain: int) -> dict[str, str]:
+    """Environment of the nodes: their DDS domain, on this machine only, logs below the output."""
     return os.environ | {
-        "ROS_DOMAIN_ID": str(random.choice(_DOMAINS)),
+        "ROS_DOMAIN_ID": str(domain),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(output / "log" / "ros"),
     }
@@ -303,7 +301,10 @@ def drive_over_dds(plan: Plan, loaded: Loaded) -> Outcome:
     common |= {"rate_hz": plan.rate_hz, "friction": plan.friction}
     result = plan.output / "drive.npz"
     bag = plan.output / "bag"
-    with Children(environment(plan.output.absolute()), plan.output / "log") as children:
+    with (
+        claimed_domain() as domain,
+        Children(environment(plan.output.absolute(), domain), plan.output / "log") as children,
+    ):
         recorder = None
         if plan.record:
             recorder = children.start(

@@ -177,7 +177,7 @@ def drive(minutes: float, folder: Path) -> tuple[dict[str, list[int]], Witness, 
     rows = [f"{30.0 * i:.1f},{5.0 if i % 2 else 15.0}" for i in range(1, 2 * turns)]
     files.atomic_write(cycle, ("time_s,speed_mps\n0.0,0.0\n" + "\n".join(rows) + "\n").encode())
     memory: dict[str, list[int]] = {}
-    with claimed_domain() as domain, Children(environment(folder) | {"ROS_DOMAIN_ID": str(domain)}, folder) as children:
+    with claimed_domain() as domain, Children(environment(folder, domain), folder) as children:
         bag, result = folder / "bag", folder / "drive.npz"
         recorder = children.start("recorder", node_command("recorder", {"output": str(bag)}))
         manager = children.start(

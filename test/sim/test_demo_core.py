@@ -91,11 +91,28 @@ def test_every_node_has_its_parameter_file():
         assert str(resolve(path)) in demo.node_command(node, {})
 
 
-def test_nodes_get_a_domain_of_their_own_on_this_machine(tmp_path):
-    given = demo.environment(tmp_path)
-    assert 1 <= int(given["ROS_DOMAIN_ID"]) <= 101
+def test_nodes_get_their_domain_on_this_machine(tmp_path):
+    given = demo.environment(tmp_path, 17)
+    assert given["ROS_DOMAIN_ID"] == "17"
     assert given["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert given["ROS_LOG_DIR"].startswith(str(tmp_path))
+
+
+def test_demos_at_the_same_time_have_different_domains(tmp_path, monkeypatch):
+    plan = demo.parse(["--output", str(tmp_path)])
+    domains = []
+
+    class AnotherDemoMeanwhile:
+        def __init__(self, environment, _logs):
+            domains.append(environment["ROS_DOMAIN_ID"])
+            if len(domains) == 40:
+                raise InterruptedError
+            demo.drive_over_dds(plan, None)
+
+    monkeypatch.setattr(demo, "Children", AnotherDemoMeanwhile)
+    with pytest.raises(InterruptedError):
+        demo.drive_over_dds(plan, None)
+    assert len(set(domains)) == 40
 
 
 def test_the_closed_loop_gets_the_settings_the_power_managers_file_gives(monkeypatch):
