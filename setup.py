@@ -17,13 +17,13 @@ MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 NAME = str(MANIFEST.findtext("name"))
 
 EXECUTABLES = {
-    "demo": "iwm_sim.demo:main",
-    "evaluate": "iwm_sim.study.evaluate:main",
-    "power_manager": "iwm_power_manager.nodes.power_manager:main",
-    "recorder": "iwm_power_manager.nodes.recorder:main",
-    "replay": "iwm_power_manager.tools.replay:main",
-    "simulator": "iwm_sim.simulator:main",
-    "solve_policy": "iwm_power_manager.tools.solve_policy:main",
+    "demo": "iwm_sim.executables:demo",
+    "evaluate": "iwm_sim.executables:evaluate",
+    "power_manager": "iwm_power_manager.executables:power_manager",
+    "recorder": "iwm_power_manager.executables:recorder",
+    "replay": "iwm_power_manager.executables:replay",
+    "simulator": "iwm_sim.executables:simulator",
+    "solve_policy": "iwm_power_manager.executables:solve_policy",
 }
 
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 import enum
 import gc
 import math
-import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, cast
 
 import rclpy
@@ -37,7 +37,8 @@ from iwm_power_manager.ros import messages as m
 from iwm_power_manager.ros import qos
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
-from iwm_power_manager.ros.parameters import Change, Spec, Value, declare
+from iwm_power_manager.ros.interruption import Interruption
+from iwm_power_manager.ros.parameters import Change, Spec, declare
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import IDLE_DRIVES, load_vehicle
 from iwm_sim.drive import Drive, save_run
@@ -54,18 +55,7 @@ _LAST_WORDS_S = 5.0
 _PATIENCE = 20
 _PATIENCE_S = 0.0002
 
-
-def _spec(
-    name: str,
-    default: Value,
-    description: str,
-    low: float = -math.inf,
-    high: float = math.inf,
-    choices: tuple[str, ...] = (),
-    length: int = 0,
-) -> Spec:
-    return Spec(name, default, description, low, high, choices, length, Change.NEVER)
-
+_spec = partial(Spec, change=Change.NEVER)
 
 PARAMETERS = (
     _spec("vehicle_file", "config/vehicles/jalalmaab_2015.yaml", "Vehicle file of the car that is driven."),
@@ -415,24 +405,10 @@ class Simulator(Node):
         self.done.set_exception(error)
 
 
-class _Interruption:
-    """Handler of SIGINT and SIGTERM: ends a start at once, and a drive between two callbacks, never inside one."""
-
-    def __init__(self) -> None:
-        self.driving = False
-        self.requested = False
-
-    def __call__(self, _number: int, _frame: Any) -> None:
-        self.requested = True
-        if not self.driving:
-            raise KeyboardInterrupt
-
-
 def main(args: Sequence[str] | None = None) -> int:
     """Drive the cycle; returns the exit code: 0 at its end or on Ctrl-C, 1 with one line on an error."""
-    interruption = _Interruption()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, interruption)
+    interruption = Interruption()
+    interruption.install()
     try:
         check_parameter_files(sys.argv if args is None else list(args))
         check_arguments("simulator", "A driver and a car on a drive cycle, seen through topics.", PARAMETERS, args)
@@ -441,7 +417,7 @@ def main(args: Sequence[str] | None = None) -> int:
         node = Simulator()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        interruption.driving = True
+        interruption.started = True
         # The node's timers wake the executor often enough for a signal to be noticed.
         while not node.done.done() and not interruption.requested:
             executor.spin_once()

@@ -7,7 +7,6 @@ clock, the lifecycle and nothing else. See docs/interface.md for topics and para
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from typing import Any
@@ -37,6 +36,7 @@ from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerMa
 from iwm_power_manager.ros import diagnostics, messages, qos, realtime
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
+from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare, unknown
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
@@ -509,37 +509,43 @@ class PowerManager(LifecycleNode):
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; exit code 1 and one line if it cannot start."""
-    stopped = False
-
-    def on_signal(_signum: int, _frame: object) -> None:
-        nonlocal stopped
-        stopped = True
-
     # rclpy's own handlers would shut the context down before zero torque could be commanded.
-    signal.signal(signal.SIGINT, on_signal)
-    signal.signal(signal.SIGTERM, on_signal)
+    interruption = Interruption()
+    interruption.install()
+    node: PowerManager | None = None
     try:
         check_parameter_files(sys.argv if args is None else args)
         check_arguments("power_manager", "Splits the driver's power demand between four motors.", config.SPECS, args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PowerManager()
+        if node.get_parameter("autostart").value and not node.start():
+            return 1
+        interruption.started = True
+        _spin(node, interruption)
+    except KeyboardInterrupt:
+        pass  # ended before it had begun
     except (IwmError, RuntimeError) as error:
         print(f"power_manager: {str(error).splitlines()[0]}", file=sys.stderr)
-        rclpy.try_shutdown()
         return 1
-    started = not node.get_parameter("autostart").value or node.start()
+    finally:
+        if node is not None:
+            node.stop()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _spin(node: PowerManager, interruption: Interruption) -> None:
+    """Serve callbacks until a signal asks to end."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    while started and not stopped:
+    while not interruption.requested:
         try:
             executor.spin_once()
         except Exception as error:  # noqa: BLE001 - whatever it is, the motors must not be left with a command
             node.fail(f"{type(error).__name__}: {error}")
     node.stop()
     executor.shutdown()
-    node.destroy_node()
-    rclpy.shutdown()
-    return 0 if started else 1
 
 
 if __name__ == "__main__":

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
-from bench import Bench, Running, arguments
+from bench import PATIENCE_S, Bench, Running, arguments
 
 from iwm_power_manager.files import read_yaml
 from iwm_power_manager.nodes import power_manager_config as config
@@ -82,6 +83,20 @@ def test_it_runs_from_its_parameter_file_in_a_namespace_with_remaps(tmp_path, co
     finally:
         running.process.kill()
         bench.close()
+
+
+def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, monkeypatch) -> None:
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("IWM_CACHE_DIR", str(cache))
+    running = Running(MODULE, arguments({"strategy": "equal"}), DOMAIN, tmp_path)
+    end = time.monotonic() + PATIENCE_S
+    while not any(cache.rglob("*.nbc")):  # the first kernels of the law: `step` comes last
+        assert running.process.poll() is None, running.text()
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert running.stop(signal.SIGINT) == 0
+    assert "Traceback" not in running.text()
+    assert not any(cache.rglob("law.step-*.nbc")), "it went on compiling"
 
 
 def test_a_parameter_that_does_not_exist_is_warned_about(start_pair) -> None:

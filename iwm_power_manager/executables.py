@@ -1,0 +1,61 @@
+"""What the installed commands run.
+
+To import compiled libraries takes seconds, and Ctrl-C would end that in a traceback from wherever it was. So a command
+imports its module here, and until that is done Ctrl-C ends the process on the spot.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+
+#: Ctrl-C is how a node is ended: `ros2 launch` reports every other code as a crash.
+NODE_ENDED = 0
+#: What a shell makes of a command that Ctrl-C has ended.
+INTERRUPTED = 130
+
+
+def run(module: str, interrupted: int) -> int:
+    """Import a module and run its `main`.
+
+    Parameters
+    ----------
+    module : full name
+    interrupted : exit code on Ctrl-C, as long as `main` does not deal with it
+
+    Returns
+    -------
+    int
+        Exit code.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored, as under nohup
+        # No exception: libraries make something else of one that meets them half imported.
+        signal.signal(signal.SIGINT, lambda *_: os._exit(interrupted))
+    main = importlib.import_module(module).main
+    try:
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        return int(main())
+    except KeyboardInterrupt:
+        return interrupted
+
+
+def power_manager() -> int:
+    """Node `power_manager`."""
+    return run("iwm_power_manager.nodes.power_manager", NODE_ENDED)
+
+
+def recorder() -> int:
+    """Node `recorder`."""
+    return run("iwm_power_manager.nodes.recorder", NODE_ENDED)
+
+
+def replay() -> int:
+    """Command `replay`."""
+    return run("iwm_power_manager.tools.replay", INTERRUPTED)
+
+
+def solve_policy() -> int:
+    """Command `solve_policy`."""
+    return run("iwm_power_manager.tools.solve_policy", INTERRUPTED)

@@ -1,0 +1,20 @@
+"""What the installed commands of this package run; see `iwm_power_manager.executables`."""
+
+from __future__ import annotations
+
+from iwm_power_manager.executables import INTERRUPTED, NODE_ENDED, run
+
+
+def demo() -> int:
+    """Command `demo`."""
+    return run("iwm_sim.demo", INTERRUPTED)
+
+
+def evaluate() -> int:
+    """Command `evaluate`."""
+    return run("iwm_sim.study.evaluate", INTERRUPTED)
+
+
+def simulator() -> int:
+    """Node `simulator`."""
+    return run("iwm_sim.simulator", NODE_ENDED)

@@ -1,0 +1,89 @@
+"""Ctrl-C ends an installed command cleanly, however early it comes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from iwm_power_manager import executables
+from iwm_sim import executables as sim_executables
+
+ROOT = Path(__file__).resolve().parents[1]
+NODES = ["power_manager", "recorder", "simulator"]
+COMMANDS = ["demo", "evaluate", "replay", "solve_policy"]
+
+#: Stands in for a library whose import takes long.
+SLOW = """\
+import signal
+signal.signal(signal.SIGUSR1, lambda *_: print("still importing", flush=True))
+print("importing", flush=True)
+try:
+    while True:
+        signal.pause()
+except BaseException as error:
+    raise ImportError("half imported") from error
+"""
+
+
+def start(name: str, library: str, folder: Path, setup: str = "pass") -> subprocess.Popen[str]:
+    """Start an executable as its launcher does, with a library that is still being imported."""
+    (folder / f"{library}.py").write_text(SLOW)
+    package = "iwm_power_manager" if hasattr(executables, name) else "iwm_sim"
+    code = f"import sys; {setup}; from {package}.executables import {name}; sys.exit({name}())"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "importing\n"
+    return process
+
+
+@pytest.mark.parametrize(
+    ("name", "library", "code"),
+    [(name, "rclpy", 0) for name in NODES] + [(name, "numpy", 130) for name in COMMANDS],
+)
+def test_ctrl_c_during_the_imports_ends_it_without_a_word(tmp_path, name, library, code) -> None:
+    process = start(name, library, tmp_path)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=60) == ("", "")
+    assert process.returncode == code
+
+
+def test_where_ctrl_c_is_ignored_the_imports_ignore_it_too(tmp_path) -> None:
+    process = start("demo", "numpy", tmp_path, "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)")
+    process.send_signal(signal.SIGINT)
+    process.send_signal(signal.SIGUSR1)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "still importing\n"
+    process.terminate()
+    process.communicate(timeout=60)
+
+
+def test_ctrl_c_that_main_does_not_deal_with_gives_the_exit_code(monkeypatch) -> None:
+    def main() -> int:
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(executables.importlib, "import_module", lambda name: type(name, (), {"main": main}))
+    assert executables.run("some.module", executables.INTERRUPTED) == 130
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize("module", [executables, sim_executables])
+def test_every_executable_names_a_module_with_a_main(module, monkeypatch) -> None:
+    named = []
+    monkeypatch.setattr(module, "run", lambda name, _: named.append(name) or 0)
+    for name in NODES + COMMANDS:
+        if hasattr(module, name):
+            assert getattr(module, name)() == 0
+    assert named
+    assert all(callable(executables.importlib.import_module(name).main) for name in named)
