@@ -143,11 +143,14 @@ def test_shut_down_while_active_it_commands_zero(start_pair) -> None:
     assert pair.running.stop() == 0
 
 
-def test_shut_down_before_it_is_active_it_is_finalized_and_commands_nothing(start_pair) -> None:
+@pytest.mark.parametrize("before", ["unconfigured", "inactive"])
+def test_shut_down_before_it_is_active_it_is_finalized_and_commands_nothing(start_pair, before) -> None:
     pair = start_pair({"autostart": False})
     bench = pair.bench
-    assert bench.change_state("configure")
-    assert bench.change_state("shutdown_inactive")
+    if before == "inactive":
+        assert bench.change_state("configure")
+    assert bench.lifecycle_state() == before
+    assert bench.change_state(f"shutdown_{before}")
     assert bench.lifecycle_state() == "finalized"
     assert not bench.change_state("configure")
     assert bench.torques == []
