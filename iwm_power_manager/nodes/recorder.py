@@ -7,7 +7,6 @@ Three threads share the work: this module's main loop takes messages from DDS (`
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import signal
 import sys
@@ -16,6 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ from ..ros.messages import (
     WHEEL_TORQUE_COMMAND,
     ns_to_stamp,
 )
-from ..ros.parameters import Change, ParameterError, Spec, Value, declare
+from ..ros.parameters import Change, ParameterError, Spec, declare
 from ..ros.raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET, RawSubscriptions, Taken
 from ..ros.remote_parameters import RemoteParameters
 from ..share import resolve
@@ -78,17 +78,7 @@ _DISK_BEHIND_S = 1.0
 _FINAL_QUIET_S = 0.1
 _FINAL_WAIT_S = 2.0
 
-
-def _spec(
-    name: str,
-    default: Value,
-    description: str,
-    low: float = -math.inf,
-    high: float = math.inf,
-    choices: tuple[str, ...] = (),
-) -> Spec:
-    return Spec(name, default, description, low, high, choices, change=Change.NEVER)
-
+_spec = partial(Spec, change=Change.NEVER)
 
 #: What stands in the bag's custom metadata about a file of the drive: its name and SHA-256.
 _IDENTIFIED_FILES = ("policy", "vehicle")
