@@ -103,6 +103,14 @@ def test_exactly_at_a_limit_nothing_is_cut():
     assert battery_scale(-50.0, -40.0, 45.0, 46.0, 0.0, -brake - 1e-6, motor) < 1.0
 
 
+def test_a_limit_that_a_factor_meets_exactly_is_used_up():
+    motor = CARS[1].motor
+    # One half is the first factor the search tries.
+    drive, brake = car_power_w(25.0, 20.0, 45.0, 46.0, motor), car_power_w(-25.0, -20.0, 45.0, 46.0, motor)
+    assert battery_scale(50.0, 40.0, 45.0, 46.0, drive, 0.0, motor) == 0.5
+    assert battery_scale(-50.0, -40.0, 45.0, 46.0, 0.0, -brake, motor) == 0.5
+
+
 def test_an_empty_battery_takes_the_regeneration_that_fits_and_not_none():
     motor = CARS[1].motor
     scale = battery_scale(-80.0, -80.0, 45.0, 45.0, 0.0, 500.0, motor)

@@ -83,6 +83,12 @@ def test_brakes_can_always_hold_a_car_at_rest():
     assert torque_room_nm(True, 0.0, 0.0, 1.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) < UNLIMITED_NM
 
 
+def test_at_walking_pace_braking_steers_the_wheel_to_a_stop_and_never_backwards():
+    # A slip speed of 0.3 m/s would be backwards at 0.1 m/s.
+    room = torque_room_nm(True, -10.0, 0.0, 0.1, 0.15, 0.03, 0.05, RADIUS, INERTIA)
+    assert room == pytest.approx(10.0)
+
+
 def test_a_car_at_rest_can_start():
     # 0.3 m/s of slip speed within 0.03 s.
     assert torque_room_nm(False, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == pytest.approx(

@@ -105,6 +105,8 @@ class TestSupervise:
         last = run(degraded, 0, 18)
         assert (last.mode, last.motor_factor) == (MODE_RECOVERING, 0.9375)
         assert run(degraded, 0, 19)[:4] == (MODE_NORMAL, 0, 1.0, 1.0)
+        slower = LIMITS._replace(resume_s=4.0)
+        assert supervise(waiting, 0, DT, slower).motor_factor == 0.015625
 
     def test_a_relapse_starts_the_healthy_time_anew(self) -> None:
         degraded = run(NORMAL, STALE_SPEED, 20)
@@ -155,16 +157,19 @@ class TestShapeDemand:
         state = NORMAL._replace(stale=STALE_SPEED, motor_factor=0.25)
         assert shape_demand(8000.0, 20.0, 20.0, state) == 2000.0
         assert shape_demand(8000.0, 20.0, 5.0, state._replace(stale=STALE_DEMAND)) == 2000.0
+        assert shape_demand(0.5, 20.0, 20.0, state) == 0.125
 
     def test_a_live_brake_demand_gets_through_in_full_whatever_else_is_missing(self) -> None:
         state = Supervision(MODE_DEGRADED, STALE_SPEED | STALE_WHEELS | STALE_BATTERY, 0.0, 1.0, 0.0)
         assert shape_demand(-8000.0, 20.0, 5.0, state) == -8000.0
+        assert shape_demand(-0.5, 20.0, 5.0, state) == -0.5
 
     def test_a_stale_brake_demand_holds_its_force_and_lets_go_of_it(self) -> None:
         state = Supervision(MODE_DEGRADED, STALE_DEMAND, 0.0, 0.5, 0.0)
         # Half the force: half the power at the speed of then, a quarter at half that speed.
         assert shape_demand(-8000.0, 20.0, 20.0, state) == -4000.0
         assert shape_demand(-8000.0, 20.0, 10.0, state) == -2000.0
+        assert shape_demand(-8000.0, 16.0, 0.001, state) == -0.25
         assert shape_demand(-8000.0, 20.0, 0.0, state) == 0.0
 
     def test_a_stale_brake_demand_never_grows(self) -> None:
