@@ -145,6 +145,7 @@ class TestWheels:
         assert monitor.wheel_speed_radps == (1.0, 2.0, 3.0, 4.0)
         assert monitor.verdicts == (WheelVerdict.GOOD,) * 4
         assert monitor.ages_s(NOW)[1] == 0.0
+        assert not monitor.tallies[WHEELS].dropped
 
     def test_a_message_without_one_wheel_is_counted_and_its_other_wheels_are_used(self, monitor) -> None:
         assert monitor.take_wheels(wheels(NOW, (1.0, 2.0, 3.0), NAMES[:3]), NOW)
@@ -190,6 +191,12 @@ class TestWheels:
         assert monitor.wheel_speed_radps == (20.0,) * 4
         assert monitor.take_wheels(wheels(NOW + 20 * MS, (31.9, 20.0, 20.0, 20.0)), NOW + 20 * MS)
         assert monitor.wheel_speed_radps[0] == 31.9
+
+    def test_a_stamp_that_goes_back_has_no_time_behind_it(self) -> None:
+        monitor = InputMonitor(NAMES, LIMITS._replace(stamp=None))
+        monitor.take_wheels(wheels(NOW), NOW)
+        monitor.take_wheels(wheels(NOW - 10 * MS, (22.1, 22.0, 20.0, 20.0)), NOW)
+        assert monitor.verdicts == (WheelVerdict.JUMPED, WheelVerdict.GOOD, WheelVerdict.GOOD, WheelVerdict.GOOD)
 
     def test_time_of_dropped_messages_is_counted_once(self, monitor) -> None:
         monitor.take_wheels(wheels(NOW), NOW)
