@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -31,6 +32,7 @@ from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS, LockstepQ
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.nodes import power_manager_config as config
+from iwm_power_manager.nodes.demand_log import DemandLog
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport
 from iwm_power_manager.ros import diagnostics, messages, qos, realtime
@@ -95,6 +97,7 @@ class PowerManager(LifecycleNode):
         self._queue = LockstepQueue()
         self._controller: Controller | None = None
         self._policies: Policies | None = None
+        self._demand_log: DemandLog | None = None
         self._intake = Intake(self)
         self._demand_subscription: Any = None
         self._publishers_made: dict[str, Any] = {}
@@ -236,6 +239,10 @@ class PowerManager(LifecycleNode):
             self._controller.step(0, self._period_s)
         self._controller.policy = policies.table(values["friction"])
         self._controller.reset()
+        if values["demand_log"]:
+            self._demand_log = DemandLog(
+                Path(values["demand_log"]), values["demand_log_period_s"], self._controller.policy
+            )
         self._report = PowerManagerReport(
             self.get_name(), self._wheel_names, None if self._lockstep else values["rate_hz"]
         )
@@ -272,6 +279,9 @@ class PowerManager(LifecycleNode):
         self._publishers_made = {}
         self._controller = None
         self._policies = None
+        if self._demand_log:
+            self._demand_log.close()
+            self._demand_log = None
         if self._values["gc_off_path"]:
             realtime.resume_automatic_collection()
 
@@ -285,10 +295,14 @@ class PowerManager(LifecycleNode):
         self._command_zero()
         for topic in _COMMANDS:
             self._publishers_made[topic].wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
+        if self._demand_log and (problem := self._demand_log.write()):
+            self.get_logger().error(problem)
 
     def _start_over(self) -> None:
         assert self._controller is not None
         self._controller.reset()
+        if self._demand_log:
+            self._demand_log.pause()
         self._last_step_ns = None
         self._answer = None
 
@@ -384,6 +398,8 @@ class PowerManager(LifecycleNode):
             messages.named_numbers_message(stamp_ns, SIGNAL_NAMES, numbers),
         )
         self._publish(self._answer)
+        if self._demand_log:
+            self._demand_log.note(stamp_ns, numbers)
         self._report.note_step(command, since_s, time.perf_counter() - started_s)
 
     def _publish(self, answer: tuple[JointState, JointState, JointState]) -> None:
@@ -479,6 +495,8 @@ class PowerManager(LifecycleNode):
             now_ns, self._lifecycle_state(), self._controller, self._values, self._own_statuses()
         )
         self._diagnostics.publish(message)
+        if self._demand_log:
+            self._demand_log.write_if_due()
         if self._controller and self._values["gc_off_path"]:
             realtime.collect()
 
@@ -488,6 +506,8 @@ class PowerManager(LifecycleNode):
             statuses.append(diagnostics.Status("fault", diagnostics.ERROR, self._fault, {}))
         if self._policies:
             statuses.append(self._policies.status())
+        if self._demand_log:
+            statuses.append(self._demand_log.status())
         if self._active:
             counts = {topic: self.count_publishers(topic) for topic in _COMMANDS}
             others = [f"{topic} has {count} publishers" for topic, count in counts.items() if count > 1]

@@ -189,6 +189,19 @@ SPECS = (
         "Freeze what exists after configuring and collect garbage once a second after a step, never inside one.",
         change=Change.NEVER,
     ),
+    Spec(
+        "demand_log",
+        "",
+        "File that counts the driver's demand for solve_policy --transitions; it goes on from one that exists; '' for "
+        "none.",
+    ),
+    Spec(
+        "demand_log_period_s",
+        300.0,
+        "The counts are written this often, and when commanding ends, s.",
+        1.0,
+        86400.0,
+    ),
     Spec("realtime_priority", 0, "SCHED_FIFO priority; 0 keeps the normal scheduler.", 0, 99, change=Change.NEVER),
     Spec(
         "cpu_affinity", "", "Processors the node may run on, such as '1' or '0,2'; empty is all.", change=Change.NEVER

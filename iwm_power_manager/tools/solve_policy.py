@@ -20,6 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from iwm_power_manager import __version__
+from iwm_power_manager.bags.demand_counts import transitions_source
 from iwm_power_manager.bags.mapping import load_mapping
 from iwm_power_manager.bags.signals import read_signal
 from iwm_power_manager.cycle import load_cycle
@@ -118,6 +119,13 @@ def parser() -> argparse.ArgumentParser:
         metavar="BAG",
         help="rosbag2 recording with a power demand; repeat for more",
     )
+    demand.add_argument(
+        "--transitions",
+        action="append",
+        default=[],
+        metavar="NPZ",
+        help="demand counted by the power manager (its parameter demand_log); repeat for more",
+    )
     demand.add_argument("--mapping", metavar="YAML", help="topics and units of foreign bags (config/bags/)")
     demand.add_argument(
         "--bag-weight",
@@ -182,8 +190,8 @@ def _demand_arguments(options: argparse.Namespace) -> None:
     for name in ("friction", "output"):
         if not getattr(options, name):
             raise ConfigError("arguments", f"--{name}", "is missing")
-    if not options.cycle and not options.bag:
-        raise ConfigError("arguments", "--cycle", "is missing", "one cycle or bag, or more")
+    if not (options.cycle or options.bag or options.transitions):
+        raise ConfigError("arguments", "--cycle", "is missing", "one cycle, bag or file of transitions, or more")
     check_number("arguments", "--bag-weight", options.bag_weight, 0.0, 1e6, above=True)
 
 
@@ -210,7 +218,7 @@ def _sources(options: argparse.Namespace, dt_s: float, vehicle: Vehicle) -> list
                 Path(path).name, drive.time_s, drive.power_demand_w, dt_s, options.bag_weight, drive.speed_mps
             )
         )
-    return sources
+    return sources + [transitions_source(path, dt_s, options.bag_weight) for path in options.transitions]
 
 
 def _targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequence[float]) -> list[Path]:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from bags_helpers import TWIST, float64, topic, twist
+from iwm_power_manager.bags.demand_counts import DemandCounter, save_transitions
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import empty_table, load_policy
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools import solve_policy
@@ -92,6 +94,24 @@ def test_the_matrix_is_counted_from_every_step_that_was_driven(drive, bag, grid,
     expected = counts[rows] / counts[rows].sum(axis=1, keepdims=True)
     assert policy.chain.probability[rows] == pytest.approx(expected, abs=0.02)
     assert policy.sources[0]["name"] == "nycc_drive"
+
+
+def test_what_was_counted_while_driving_teaches_what_the_bag_does(drive, bag, grid, tmp_path):
+    problem = load_problem(grid)
+    counter = DemandCounter(problem.power_w, problem.speed_mps, problem.dt_s)
+    for i, (speed, demand) in enumerate(zip(drive["speed_mps"], drive["power_demand_w"], strict=True)):
+        counter.add((i + 1) * 10_000_000, float(speed), float(demand))
+    save_transitions(counter.transitions(), tmp_path / "demand.npz")
+    counted = _solve(tmp_path / "counted.npz", grid, "--transitions", tmp_path / "demand.npz")
+    learned = _solve(tmp_path / "bag.npz", grid, "--bag", bag)
+    assert counted.sources[0]["name"] == "demand.npz"
+    assert counted.chain.row_steps == pytest.approx(learned.chain.row_steps, abs=1.0)
+    assert counted.front_share == pytest.approx(learned.front_share, abs=0.2)
+    assert np.mean(counted.front_share != learned.front_share) < 0.01
+    mixed = _solve(
+        tmp_path / "mixed.npz", grid, "--cycle", "nycc", "--bag-weight", 3, "--transitions", tmp_path / "demand.npz"
+    )
+    assert [source["weight"] for source in mixed.sources] == [1.0, 3.0]
 
 
 def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(bag, grid, tmp_path):
