@@ -218,6 +218,37 @@ class TestMissingInputs:
         assert values["power_demand_w"] < 7000.0
 
 
+class TestStandIns:
+    WHEELS = (30.4, 30.5, 30.6, 30.7)
+
+    @pytest.mark.parametrize("stale", range(16))
+    def test_speed_and_wheels_stand_in_for_each_other_and_for_nothing_else(self, drive, stale) -> None:
+        drive.run(60)
+        bits = {"speed": STALE_SPEED, "wheels": STALE_WHEELS, "demand": STALE_DEMAND, "battery": STALE_BATTERY}
+        without = tuple(name for name, bit in bits.items() if stale & bit)
+        values = drive.run(40, speed=10.2, wheels=self.WHEELS, without=without)
+        assert values["stale"] == stale
+        speed = 10.0 if stale & STALE_SPEED else 10.2
+        wheels = (10.0 / RADIUS,) * 4 if stale & STALE_WHEELS else self.WHEELS
+        if stale & STALE_SPEED and not stale & STALE_WHEELS:
+            speed = RADIUS * 30.4
+        if stale & STALE_WHEELS and not stale & STALE_SPEED:
+            wheels = (10.2 / RADIUS,) * 4
+        assert values["speed_mps"] == speed
+        assert tuple(values[f"{wheel}_speed_radps"] for wheel in NAMES) == wheels
+
+    @pytest.mark.parametrize(("demand", "wheel"), [(0.5, 30.4), (0.0, 30.4), (-0.5, 30.7)])
+    def test_the_wheel_that_slips_least_tells_the_speed(self, drive, demand, wheel) -> None:
+        drive.run(60, demand=0.0)
+        values = drive.run(10, wheels=self.WHEELS, demand=demand, without=("speed",))
+        assert values["speed_mps"] == RADIUS * wheel
+
+    @pytest.mark.parametrize(("wheel", "speed"), [(0.5, 0.5 * RADIUS), (-0.5, 0.0)])
+    def test_a_car_that_stands_or_rolls_back_a_little_is_seen_as_it_is(self, drive, wheel, speed) -> None:
+        drive.run(60, speed=0.0)
+        assert drive.run(10, wheels=(wheel,) * 4, without=("speed",))["speed_mps"] == speed
+
+
 class TestLostWheel:
     def test_the_other_wheel_of_the_axle_stands_in_and_slip_is_judged_more_strictly(self, drive) -> None:
         drive.run(60)

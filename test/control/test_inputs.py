@@ -243,7 +243,8 @@ class TestStuckWheels:
         for i in range(steps):
             now = 30.0 - 0.1 * i
             other = now if other_falls else 30.0
-            found.append(((frozen_at, other, other, other), now if car_falls else 30.0))
+            # Every message brings a number of its own, though it is the same.
+            found.append(((float(str(frozen_at)), other, other, other), now if car_falls else 30.0))
         return found
 
     def test_a_frozen_number_is_stuck_when_car_and_partner_change(self) -> None:
@@ -268,6 +269,11 @@ class TestStuckWheels:
         limits = WHEELS._replace(stuck_change_radps=7.05)
         assert follow(self.braking(30.0, 71), limits=limits).verdicts[0] is GOOD
         assert follow(self.braking(30.0, 72), limits=limits).verdicts[0] is WheelVerdict.STUCK
+
+    @pytest.mark.parametrize(("other", "car"), [(29.5, 25.0), (25.0, 29.5)])
+    def test_it_is_not_stuck_while_one_of_car_and_partner_changes_too_little(self, other, car) -> None:
+        steps = [((30.0,) * 4, 30.0), *[((30.0, other, other, other), car)] * 100]
+        assert follow(steps).verdicts[0] is GOOD
 
     def test_a_number_that_changes_is_alive_again(self) -> None:
         limits = WHEELS._replace(distrust_s=0.0)
@@ -308,6 +314,9 @@ class TestStrayedWheels:
         far = [((42.0, 30.0, 30.0, 30.0), 30.0)] * 25
         near = [((39.0, 30.0, 30.0, 30.0), 30.0)]
         assert follow(far + near + far).verdicts[0] is GOOD
+        assert follow(near + [((42.0 + 0.001 * i, 30.0, 30.0, 30.0), 30.0) for i in range(33)]).verdicts[0] is (
+            WheelVerdict.STRAYED
+        )
 
     def test_of_two_that_disagree_the_one_nearer_to_the_car_is_believed(self) -> None:
         steps = [((42.0, 30.0, 30.0, 30.0), 41.0)] * 40

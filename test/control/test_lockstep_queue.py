@@ -58,14 +58,22 @@ def test_a_demand_left_over_from_an_incomplete_set_is_not_taken_for_the_next() -
 
 
 def test_an_incomplete_set_is_skipped_once_the_next_is_complete() -> None:
-    for missing in (SPEED, WHEELS, BATTERY):
+    for missing in ((SPEED,), (WHEELS,), (BATTERY,), (SPEED, WHEELS), (WHEELS, BATTERY), (BATTERY, SPEED)):
         queue = LockstepQueue()
-        push_set(queue, 10, 100, without=(missing,))
+        push_set(queue, 10, 100, without=missing)
         push_set(queue, 20, 200)
-        found = queue.pop()
-        assert found is not None
-        assert (found.stamp_ns, found.demand) == (20, 20.0)
+        assert queue.pop() == (20, (SPEED, 20), (WHEELS, 20), (BATTERY, 20), 20.0)
         assert queue.pop() is None
+
+
+def test_a_clock_too_coarse_to_tell_messages_apart_loses_none() -> None:
+    queue = LockstepQueue()
+    for stamp in (10, 20):
+        for topic in (SPEED, WHEELS, BATTERY):
+            queue.push(topic, stamp, 100, stamp)
+        queue.push_demand(100, float(stamp))
+    assert queue.pop() == (10, 10, 10, 10, 10.0)
+    assert queue.pop() == (20, 20, 20, 20, 20.0)
 
 
 def test_a_set_whose_demand_was_lost_does_not_take_that_of_the_next() -> None:
@@ -118,6 +126,9 @@ def test_clearing_forgets_messages_and_the_last_answer() -> None:
     push_set(queue, 20, 200, without=(WHEELS,))
     queue.clear()
     assert not queue.waiting
+    push_set(queue, 20, 250, without=(SPEED, BATTERY))
+    assert queue.pop() is None
+    queue.clear()
     push_set(queue, 10, 300)
     found = queue.pop()
     assert found is not None

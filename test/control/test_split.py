@@ -36,7 +36,7 @@ def _solved(previous=(0.0, 0.5, 1.0)):
         **axes,
         front_share=rng.uniform(0.0, 1.0, shape),
         expected_cost_j=rng.uniform(0.0, 300.0, shape),
-        discount=0.95,
+        discount=0.6,
         switching_cost_j=20.0,
         switching_fixed_cost_j=5.0,
     )
@@ -58,6 +58,13 @@ def within_rounding(costs, ours, slack):
 
 @given(POWER)
 def test_the_rule_is_one_line_for_driving_and_one_for_braking(power):
+    assert rule_share(power, TABLE) == pytest.approx(splits.rule(power, TABLE.rule))
+
+
+@pytest.mark.parametrize("power", [0.5, -0.5, 5000.0, -5000.0])
+def test_a_rule_stays_within_0_and_1(power):
+    backwards = TABLE._replace(rule=-TABLE.rule)
+    assert rule_share(power, backwards) == pytest.approx(splits.rule(power, backwards.rule))
     assert rule_share(power, TABLE) == pytest.approx(splits.rule(power, TABLE.rule))
 
 
@@ -98,12 +105,25 @@ def test_at_equal_cost_the_share_stays():
         loss_linear_torque=0.0,
         loss_quadratic_torque=0.0,
     )
-    assert cheapest_share(4000.0, 12.0, 0.37, 0.9, False, 0.0, CARS[0]._replace(motor=motor), TABLE) == 0.37
+    car = CARS[0]._replace(motor=motor)
+    assert cheapest_share(4000.0, 12.0, 0.37, 0.9, False, 0.0, car, TABLE) == 0.37
+    assert decide(4000.0, 12.0, 0.0, 0.0, 0.37, 0.9, 0, default_settings("instantaneous"), car, TABLE) == 0.37
+
+
+def test_a_change_is_made_for_a_saving_beyond_rounding():
+    point = (4000.0, 12.0, 0.1, 0.9, True)
+    _, costs = splits.cheapest(*point, 0.0, CARS[0], SHARES)
+    saving = costs[0.1] + splits.TELLS_APART_W - min(costs.values())
+    assert saving > 1.0
+    assert cheapest_share(*point, saving - 0.5, CARS[0], TABLE) != 0.1
+    assert cheapest_share(*point, saving - 5e-4, CARS[0], TABLE) == 0.1
 
 
 def test_what_cannot_be_delivered_costs_more_than_any_loss():
     # Alone, the front axle spins on ice; both together do not.
     assert 0.0 < cheapest_share(9000.0, 10.0, 0.0, 0.2, True, 100.0, CAR, TABLE) < 1.0
+    # The rear axle would save what it does not deliver.
+    assert 0.0 < cheapest_share(20e3, 17.6, 0.0, 0.1, True, 0.0, CAR, TABLE) < 1.0
 
 
 @given(st.floats(-20e3, 20e3), st.floats(0.0, 40.0), SLIP, SLIP, SHARE)
@@ -152,18 +172,46 @@ def test_the_lookahead_does_not_change_for_less_than_rounding():
     assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, CAR, twins) == 0.3
 
 
-def choose(strategy, power=5000.0, decisions=0, previous=0.3, speed=12.0, friction=0.9):
+def test_the_lookahead_changes_for_a_saving_beyond_rounding():
+    problem = TABLE.problem._replace(dt_s=0.1)
+    free = TABLE._replace(problem=problem, discount=0.0, switching_cost_j=0.0, switching_fixed_cost_j=0.0)
+    costs = {
+        share: step_cost_and_next(4000.0, 12.0, 0.0, 0.0, share, CARS[0], problem).cost_j for share in (0.1, *SHARES)
+    }
+    saving = costs[0.1] - min(costs.values())
+    assert saving > 1.0
+
+    def share(gain):
+        return lookahead_share(
+            4000.0, 12.0, 0.0, 0.0, 0.1, CARS[0], free._replace(switching_fixed_cost_j=saving - gain)
+        )
+
+    # A milliwatt for 0.1 s.
+    assert share(2e-4) != 0.1
+    assert share(5e-5) == 0.1
+
+
+def choose(strategy, power=1500.0, decisions=0, previous=0.3, speed=12.0, friction=0.9):
     s = default_settings(strategy)
     return decide(power, speed, 0.01, -0.02, previous, friction, decisions, s, CAR, TABLE)
 
 
 def test_every_strategy_is_behind_its_name():
     assert choose("equal") == 0.5
-    assert choose("rule") == rule_share(5000.0, TABLE)
-    assert choose("instantaneous", 1500.0) == cheapest_share(1500.0, 12.0, 0.3, 0.9, False, 0.0, CAR, TABLE)
-    assert choose("instantaneous_slip", 1500.0) == cheapest_share(1500.0, 12.0, 0.3, 0.9, True, 100.0, CAR, TABLE)
-    assert choose("sdp") == table_share(5000.0, 12.0, 0.01, -0.02, 0.3, TABLE)
-    assert choose("sdp_lookahead") == lookahead_share(5000.0, 12.0, 0.01, -0.02, 0.3, CAR, TABLE)
+    chosen = {
+        "rule": rule_share(1500.0, TABLE),
+        "instantaneous": cheapest_share(1500.0, 12.0, 0.3, 0.9, False, 0.0, CAR, TABLE),
+        "instantaneous_slip": cheapest_share(1500.0, 12.0, 0.3, 0.9, True, 100.0, CAR, TABLE),
+        "sdp": table_share(1500.0, 12.0, 0.01, -0.02, 0.3, TABLE),
+        "sdp_lookahead": lookahead_share(1500.0, 12.0, 0.01, -0.02, 0.3, CAR, TABLE),
+    }
+    assert {name: choose(name) for name in chosen} == chosen
+    assert len({0.5, *chosen.values()}) == 6, "strategies that decide alike cannot be told apart"
+    # On ice: one knows of slip, the other does not.
+    blind, aware = (cheapest_share(9000.0, 5.0, 0.3, 0.2, slip, 0.0, CAR, TABLE) for slip in (False, True))
+    assert blind != aware
+    assert choose("instantaneous", 9000.0, speed=5.0, friction=0.2) == blind
+    assert choose("instantaneous_slip", 9000.0, speed=5.0, friction=0.2) == aware
     assert set(t.STRATEGIES) == {
         "equal",
         "rule",
@@ -176,7 +224,7 @@ def test_every_strategy_is_behind_its_name():
 
 
 def test_a_strategy_the_law_does_not_know_is_equal_split():
-    assert decide(5000.0, 12.0, 0.0, 0.0, 0.3, 0.9, 0, default_settings()._replace(strategy=99), CAR, TABLE) == 0.5
+    assert decide(1500.0, 12.0, 0.01, -0.02, 0.3, 0.9, 0, default_settings()._replace(strategy=99), CAR, TABLE) == 0.5
 
 
 def test_the_preview_plays_its_schedule_and_holds_the_last_entry():
