@@ -514,6 +514,24 @@ def test_a_hot_motor_gives_its_continuous_torque_and_says_so():
     assert case.command.limits == t.LIMIT_MOTOR | t.LIMIT_THERMAL
 
 
+def test_an_axle_that_helps_out_up_to_its_limit_is_at_its_limit():
+    # The front axle is asked for little and hot; it gives all it can of what the rear one cannot.
+    preview = default_settings("preview")._replace(gate_mode=t.GATE_MODE_OFF)
+    table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + 0.2)
+    hot = initial_state()._replace(steps=1, front_heat=1.0, applied_share=0.2, decided_share=0.2)
+    command, _ = law.step(measurement(speed=5.0, demand=12e3), hot, preview, CAR, table)
+    assert command.limits & ~t.LIMIT_SLEW == t.LIMIT_MOTOR | t.LIMIT_THERMAL
+
+
+def test_no_demand_is_no_braking_demand():
+    driving = settle(measurement(demand=8e3))
+    coasting = take(measurement(demand=0.0), driving.after)
+    assert min(coasting.command.motor_torque_nm) > 0.0, "torque goes to zero at its rate"
+    assert coasting.command.friction_torque_nm == (0.0,) * 4
+    braking = take(measurement(demand=-1.0), driving.after)
+    assert max(braking.command.friction_torque_nm) < 0.0
+
+
 def test_hard_braking_is_shared_by_motors_and_friction_brakes():
     case = settle(measurement(demand=-16e3), DEFAULT._replace(gate_mode=t.GATE_MODE_OFF))
     assert case.command.motor_torque_nm == pytest.approx((-80.0,) * 4)
