@@ -524,11 +524,12 @@ def test_an_axle_that_helps_out_up_to_its_limit_is_at_its_limit():
 
 
 def test_no_demand_is_no_braking_demand():
-    driving = settle(measurement(demand=8e3))
-    coasting = take(measurement(demand=0.0), driving.after)
+    slow = DEFAULT._replace(slew_down_nmps=500.0)
+    driving = settle(measurement(demand=8e3), slow)
+    coasting = take(measurement(demand=0.0), driving.after, slow)
     assert min(coasting.command.motor_torque_nm) > 0.0, "torque goes to zero at its rate"
     assert coasting.command.friction_torque_nm == (0.0,) * 4
-    braking = take(measurement(demand=-1.0), driving.after)
+    braking = take(measurement(demand=-1.0), driving.after, slow)
     assert max(braking.command.friction_torque_nm) < 0.0
 
 
