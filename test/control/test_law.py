@@ -533,6 +533,57 @@ def test_no_demand_is_no_braking_demand():
     assert max(braking.command.friction_torque_nm) < 0.0
 
 
+@pytest.mark.parametrize("demand", [8e3, -8e3])
+def test_where_grip_is_lost_torque_is_cut_at_once_however_slow_its_slew(demand):
+    slow = DEFAULT._replace(slew_down_nmps=100.0)
+    gripping = settle(measurement(demand=demand), slow)
+    slip = math.copysign(0.14, demand)
+    # The wheels run away within one step: the road takes nothing any more.
+    slipping = take(measurement(slips=(slip, slip), demand=demand), gripping.after, slow)
+    for i, (_, motor, _, before, _, gated) in enumerate(slipping.axles()):
+        assert not gated
+        assert abs(before) > 20.0
+        assert abs(motor) <= slipping.grip_nm(i) + TORQUE_SLACK_NM
+        assert abs(motor) < 1.0
+
+
+def test_regeneration_on_its_way_down_is_not_driven_against():
+    slow = DEFAULT._replace(slew_down_nmps=100.0)
+    hard = settle(measurement(demand=-8e3), slow)
+    soft = take(measurement(demand=-1e3), hard.after, slow)
+    assert soft.command.motor_torque_nm == pytest.approx([nm + 1.0 for nm in hard.command.motor_torque_nm])
+    assert soft.command.friction_torque_nm == (0.0,) * 4
+
+
+@pytest.mark.parametrize("front_share", [0.0, 1.0])
+def test_a_little_friction_is_told_like_much(front_share):
+    preview = default_settings("preview")._replace(gate_mode=t.GATE_MODE_OFF)
+    table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + front_share)
+    before = initial_state()._replace(steps=1, applied_share=front_share, decided_share=front_share)
+    demand = -2.0 * (80.0 + 0.5) * 15.0 / RADIUS
+    command, _ = law.step(measurement(demand=demand), before, preview, CAR, table)
+    assert command.limits & ~t.LIMIT_SLEW == t.LIMIT_REGENERATION
+    command, _ = law.step(measurement(demand=demand + 100.0), before, preview, CAR, table)
+    assert command.limits & ~t.LIMIT_SLEW == 0
+
+
+def test_rounding_is_no_limit():
+    preview = default_settings("preview")
+    table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + 0.3)
+    wheels = {"front_speed_radps": 15.0 / RADIUS, "rear_speed_radps": 15.0 / RADIUS}
+    before = initial_state()._replace(steps=1, applied_share=0.3, decided_share=0.3, **wheels)
+    for demand in range(1000, 8000, 37):
+        command, _ = law.step(measurement(demand=float(demand)), before, preview, CAR, table)
+        assert command.limits & ~t.LIMIT_SLEW == 0
+
+
+def test_a_speed_below_zero_is_standstill():
+    m = measurement(speed=0.0, demand=2e3)
+    assert law.step(m._replace(speed_mps=-0.5), initial_state(), DEFAULT, CAR, TABLE) == law.step(
+        m, initial_state(), DEFAULT, CAR, TABLE
+    )
+
+
 def test_hard_braking_is_shared_by_motors_and_friction_brakes():
     case = settle(measurement(demand=-16e3), DEFAULT._replace(gate_mode=t.GATE_MODE_OFF))
     assert case.command.motor_torque_nm == pytest.approx((-80.0,) * 4)
