@@ -58,6 +58,7 @@ def pytest_configure(config: pytest.Config) -> None:
         ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST",
         ROS_LOG_DIR=logs.name,
         MPLBACKEND="Agg",
+        FASTRTPS_DEFAULT_PROFILES_FILE=str(Path(__file__).with_name("quick_discovery.xml")),
     )
 
 

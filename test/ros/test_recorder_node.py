@@ -37,6 +37,11 @@ LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RELIABLE = QoSProfile(depth=1000)
 
 
+def exactly(count: int) -> QoSProfile:
+    """Reliable, for so many messages: a full history asks for acknowledgement at once, not at the next heartbeat."""
+    return QoSProfile(depth=count)
+
+
 class RecorderProcess:
     """A recorder started like a user would, its output kept."""
 
@@ -138,7 +143,7 @@ def test_every_message_is_recorded_byte_by_byte_and_a_signal_ends_it_cleanly(
 ) -> None:
     process = recorder(tmp_path / "bag", "wait_for:=[/numbers,/joints]", "topics:=[/numbers]", "regex:=/joi.*")
     numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
-    joints = peer.node.create_publisher(JointState, "/joints", RELIABLE)
+    joints = peer.node.create_publisher(JointState, "/joints", exactly(200))
     peer.until_ready()
     sent_numbers = [Float64(data=float(i)) for i in range(1000)]
     sent_joints = [JointState(name=["a", "b"], velocity=[float(i), 0.5]) for i in range(200)]
@@ -284,7 +289,7 @@ def test_services_start_split_stop_and_take_snapshots(
 def test_simulated_time_is_the_log_time_and_nothing_before_the_clock_is_lost(
     tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
 ) -> None:
-    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    numbers = peer.node.create_publisher(Float64, "/numbers", exactly(51))
     clock = peer.node.create_publisher(Clock, "/clock", RELIABLE)
     process = recorder(
         tmp_path / "bag", "use_sim_time:=true", "topics:=[/numbers,/clock]", "wait_for:=[/numbers,/clock]"
@@ -307,7 +312,7 @@ def test_simulated_time_is_the_log_time_and_nothing_before_the_clock_is_lost(
 def test_without_any_clock_simulated_time_falls_back_to_the_time_of_reception(
     tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
 ) -> None:
-    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    numbers = peer.node.create_publisher(Float64, "/numbers", exactly(1))
     process = recorder(tmp_path / "bag", "use_sim_time:=true", "topics:=[/numbers]", "wait_for:=[/numbers]")
     peer.until_ready()
     numbers.publish(Float64(data=1.0))
