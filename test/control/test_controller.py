@@ -219,17 +219,18 @@ class TestMissingInputs:
 
 
 class TestStandIns:
+    HELD = (30.0, 30.1, 30.2, 30.3)
     WHEELS = (30.4, 30.5, 30.6, 30.7)
 
     @pytest.mark.parametrize("stale", range(16))
     def test_speed_and_wheels_stand_in_for_each_other_and_for_nothing_else(self, drive, stale) -> None:
-        drive.run(60)
+        drive.run(60, wheels=self.HELD)
         bits = {"speed": STALE_SPEED, "wheels": STALE_WHEELS, "demand": STALE_DEMAND, "battery": STALE_BATTERY}
         without = tuple(name for name, bit in bits.items() if stale & bit)
         values = drive.run(40, speed=10.2, wheels=self.WHEELS, without=without)
         assert values["stale"] == stale
         speed = 10.0 if stale & STALE_SPEED else 10.2
-        wheels = (10.0 / RADIUS,) * 4 if stale & STALE_WHEELS else self.WHEELS
+        wheels = self.HELD if stale & STALE_WHEELS else self.WHEELS
         if stale & STALE_SPEED and not stale & STALE_WHEELS:
             speed = RADIUS * 30.4
         if stale & STALE_WHEELS and not stale & STALE_SPEED:
