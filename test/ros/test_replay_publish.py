@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import signal
 import subprocess
@@ -9,11 +10,14 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bags_helpers import ScriptedDrive
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.replay import FRICTION_COMMAND, MOTOR_COMMAND
+from iwm_power_manager.policy import load_policy, save_policy
+from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.replay import DIFFERENT, DONE, main
 
 PATIENCE_S = 90.0
@@ -62,13 +66,18 @@ def until_says(process: subprocess.Popen[str], word: str) -> None:
 
 
 def played_to_the_node(
-    tmp_path: Path, start: Callable[..., subprocess.Popen[str]], lockstep: bool, strategy: str, inputs: Path
+    tmp_path: Path,
+    start: Callable[..., subprocess.Popen[str]],
+    lockstep: bool,
+    strategy: str,
+    inputs: Path,
+    policy_file: str = "''",
 ) -> Path:
     """Play `inputs` to a real power manager, record what happens; returns that bag."""
     parameters = [
         f"lockstep:={str(lockstep).lower()}",
         f"strategy:={strategy}",
-        "policy_file:=''",
+        f"policy_file:={policy_file}",
         "use_sim_time:=true",
         "switching_power_w:=0.0",
     ]
@@ -96,9 +105,9 @@ def commands(path: Path) -> dict[str, list[bytes]]:
 def test_the_lockstep_node_driven_by_a_bag_commands_what_the_offline_replay_does(
     tmp_path: Path, start: Callable[..., subprocess.Popen[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    strategy = "instantaneous_slip"
-    inputs = ScriptedDrive(strategy).write(tmp_path / "inputs", COUNT, state=False, commands=False)
-    recorded = played_to_the_node(tmp_path, start, True, strategy, inputs)
+    strategy, policies = "sdp", share_path("policies")
+    inputs = ScriptedDrive(strategy, policies).write(tmp_path / "inputs", COUNT, state=False, commands=False)
+    recorded = played_to_the_node(tmp_path, start, True, strategy, inputs, str(policies))
     with BagReader(recorded) as reader, BagReader(inputs) as source:
         sent = [(m.topic, m.data) for m in source.messages()]
         for topic in INPUTS:  # played byte by byte
@@ -112,12 +121,20 @@ def test_the_lockstep_node_driven_by_a_bag_commands_what_the_offline_replay_does
     assert len(online[MOTOR_COMMAND]) == COUNT
     # The node's last command is zero torque, at deactivation; it may or may not be in time for the recorder.
     assert {kind: data[:COUNT] for kind, data in online.items()} == offline
-    # And from the recorded state alone, the same once more; a changed gain is seen.
+    # And from the recorded state alone, the same once more; a changed gain or policy is seen.
     capsys.readouterr()
     assert main([str(recorded), "--compare", "--json", "-"]) == DONE
     report = json.loads(capsys.readouterr().out)
     assert (report["exact"], report["steps"]) == (True, COUNT)
-    assert main([str(recorded), "--compare", "--set", "slew_up_nmps=1599"]) == DIFFERENT
+    policy = load_policy(policies / "jalalmaab_2015_drag_coupled_mu090.npz")
+    nudged = dataclasses.replace(policy, front_share=np.clip(policy.front_share + 0.01, 0.0, 1.0))
+    save_policy(nudged, tmp_path / "nudged.npz")
+    for change in (
+        ["--set", "slew_up_nmps=1599"],
+        ["--policy", str(tmp_path / "nudged.npz")],
+        ["--friction", "0.2"],
+    ):
+        assert main([str(recorded), "--compare", *change]) == DIFFERENT, change
 
 
 def test_a_recording_of_the_real_time_node_replays_exactly(
@@ -130,6 +147,12 @@ def test_a_recording_of_the_real_time_node_replays_exactly(
     assert report["exact"]
     assert report["steps"] > 20
     assert [entry["largest"] for entry in report["comparison"]] == [0.0, 0.0, 0.0]
+    # A changed limit is seen.
+    car = share_path("config/vehicles/jalalmaab_2015.yaml").read_text()
+    weaker = car.replace("regeneration_torque_nm: 80", "regeneration_torque_nm: 20")
+    assert weaker != car
+    (tmp_path / "weaker.yaml").write_text(weaker)
+    assert main([str(recorded), "--compare", "--vehicle", str(tmp_path / "weaker.yaml")]) == DIFFERENT
 
 
 def test_start_end_and_steps_choose_what_is_played(tmp_path: Path, start: Callable[..., subprocess.Popen[str]]) -> None:
