@@ -17,11 +17,11 @@ from iwm_power_manager.control import law
 from iwm_power_manager.control.types import ControllerState, Measurement, Settings, initial_state
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.driver import DriverState, Trace, drive, sample
 from iwm_power_manager.model.tyre import slip_ratio
 from iwm_power_manager.policy import PolicyTable
 from iwm_power_manager.vehicle import Vehicle, VehicleParams
 from iwm_sim import plant
-from iwm_sim.driver import DriverState, drive
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -61,22 +61,6 @@ COLUMNS = (
 )
 
 
-class Trace(NamedTuple):
-    """A cycle sampled at the control step, as the driver sees it; arrays of equal length.
-
-    Attributes
-    ----------
-    speed_mps : now
-    ahead_mps, ahead_mps2 : speed and slope `preview_s` from now
-    grade : rise over run, now
-    """
-
-    speed_mps: FloatArray
-    ahead_mps: FloatArray
-    ahead_mps2: FloatArray
-    grade: FloatArray
-
-
 class Noise(NamedTuple):
     """Errors of the sensors, added to each sample; empty arrays mean none.
 
@@ -103,24 +87,6 @@ class Run:
 
     def __getitem__(self, column: str) -> FloatArray:
         return self.series[:, COLUMNS.index(column)]
-
-
-def sample(cycle: Cycle, dt_s: float, preview_s: float) -> Trace:
-    """The trace at 0, dt, 2 dt ... up to the cycle's end, linear between its points."""
-    start = cycle.time_s[0]
-    steps = int(np.floor((cycle.time_s[-1] - start) / dt_s + 1e-9))
-    time = start + dt_s * np.arange(steps)
-
-    def speed(at: FloatArray) -> FloatArray:
-        return np.interp(at, cycle.time_s, cycle.speed_mps)
-
-    half = 0.5 * dt_s
-    return Trace(
-        speed(time),
-        speed(time + preview_s),
-        (speed(time + preview_s + half) - speed(time + preview_s - half)) / dt_s,
-        np.interp(time, cycle.time_s, cycle.grade),
-    )
 
 
 def run(

@@ -24,8 +24,8 @@ from iwm_power_manager.model.pedals import full_braking_w
 from iwm_power_manager.model.tyre import slip_ratio
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import plant
-from iwm_sim.closed_loop import COLUMNS, Run, sample
-from iwm_sim.driver import DriverState, Pedals, drive
+from iwm_sim.closed_loop import COLUMNS, Run
+from iwm_power_manager.model.driver import DriverState, Pedals, drive, sample
 
 #: Columns of a run's series that only the control law knows; a drive leaves them empty (NaN).
 LAW_COLUMNS = ("decided_share", "front_share", "gate", "limits", "front_power_w", "rear_power_w")

@@ -27,7 +27,7 @@ def _tabulate(power_w, speed_mps, samples, share, friction, dt_s, vehicle, out):
             total = 0.0
             for i in range(k * samples, min((k + 1) * samples, power_w.size)):
                 speed = max(speed_mps[i], vehicle.driver.power_speed_floor_mps)
-                force = demand_force_n(power_w[i], speed_mps[i], vehicle)
+                force = demand_force_n(power_w[i], speed_mps[i], friction, True, vehicle)
                 power, missing = split_power_w(force, speed, share[u], friction, True, vehicle)
                 total += (power + PRICE_OF_MISSING * missing * speed) * dt_s
             out[k, u] = total

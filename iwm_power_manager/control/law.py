@@ -17,6 +17,8 @@ Steps 3 to 5 and 7 only ever make a motor torque smaller at once: no rate limit 
 
 from __future__ import annotations
 
+import math
+
 from iwm_power_manager.actuation.gate import axle_gated, gated_split
 from iwm_power_manager.actuation.limits import battery_scale, car_power_w
 from iwm_power_manager.actuation.torque import allocate, blend, conversion_speed_radps
@@ -130,11 +132,24 @@ def step(
     decisions = state.decisions
     age = state.decision_age_s + dt
     decided = state.decided_share
+    recent = state.recent_change
     # Half a step of slack: sums of 0.01 s must not delay every tenth decision by a step.
     if first or age >= settings.decision_period_s - 0.5 * dt:
+        recent *= math.exp(-age / settings.reversal_s)
         decided = decide(
-            demand, speed, front_slip, rear_slip, decided, measurement.friction, decisions, settings, vehicle, policy
+            demand,
+            speed,
+            front_slip,
+            rear_slip,
+            decided,
+            recent,
+            measurement.friction,
+            decisions,
+            settings,
+            vehicle,
+            policy,
         )
+        recent += decided - state.decided_share
         decisions += 1
         age = 0.0
     applied = decided if first else approached(state.applied_share, decided, settings.share_rate_per_s * dt)
@@ -273,6 +288,7 @@ def step(
         age,
         decided,
         applied,
+        recent,
         front_motor,
         rear_motor,
         front_motor + front_friction,

@@ -4,7 +4,8 @@
 `instantaneous` searches the split of least battery power, blind to slip. `instantaneous_slip` does so with load
 transfer and settled slips, for the same road force, and changes only if that saves enough. `sdp` looks the share up in
 the solved policy. `sdp_lookahead` takes the solved cost-to-go instead and minimises, at the continuous state, the cost
-of the next step plus the expected cost of all that follows: no rounding to grid points. `preview` plays a schedule made
+of the next step plus the expected cost of all that follows: no rounding to grid points; what it changed just now it is
+slow to take back. `preview` plays a schedule made
 with the whole cycle known.
 """
 
@@ -45,6 +46,7 @@ def decide(
     front_slip: float,
     rear_slip: float,
     previous_share: float,
+    recent_change: float,
     friction: float,
     decisions: int,
     settings: Settings,
@@ -59,6 +61,7 @@ def decide(
     speed_mps : vehicle speed
     front_slip, rear_slip : filtered slips
     previous_share : of the decision before
+    recent_change : sum of the latest changes of the share, fading out
     friction : peak friction coefficient to assume
     decisions : decisions taken so far in this run
     """
@@ -80,7 +83,16 @@ def decide(
     if strategy == SDP:
         return table_share(power_demand_w, speed_mps, front_slip, rear_slip, previous_share, policy)
     if strategy == SDP_LOOKAHEAD:
-        return lookahead_share(power_demand_w, speed_mps, front_slip, rear_slip, previous_share, vehicle, policy)
+        return lookahead_share(
+            power_demand_w,
+            speed_mps,
+            front_slip,
+            rear_slip,
+            previous_share,
+            settings.reversal_price * recent_change,
+            vehicle,
+            policy,
+        )
     return 0.5
 
 
@@ -104,7 +116,7 @@ def cheapest_share(
     policy: PolicyTable,
 ) -> float:
     """Share on the policy's share axis (or the previous one) with the least battery power now."""
-    force = demand_force_n(power_demand_w, speed_mps, vehicle)
+    force = demand_force_n(power_demand_w, speed_mps, friction, slip_aware, vehicle)
     speed = max(speed_mps, vehicle.driver.power_speed_floor_mps)
     power, missing = split_power_w(force, speed, previous_share, friction, slip_aware, vehicle)
     best = previous_share
@@ -143,24 +155,33 @@ def lookahead_share(
     front_slip: float,
     rear_slip: float,
     previous_share: float,
+    tendency: float,
     vehicle: VehicleParams,
     policy: PolicyTable,
 ) -> float:
-    """Share that minimises eq. 31 at the continuous state, with the solved cost-to-go."""
+    """Share that minimises eq. 31 at the continuous state, with the solved cost-to-go.
+
+    Parameters
+    ----------
+    tendency : where the share has just been going, > 0 to the front; a change against it costs 1 + |tendency| times
+        its price, proportional part
+    """
     best = previous_share
     best_cost = (
         _cost_j(
-            power_demand_w, speed_mps, front_slip, rear_slip, previous_share, previous_share, vehicle, policy
+            power_demand_w, speed_mps, front_slip, rear_slip, previous_share, previous_share, 0.0, vehicle, policy
         )
         - LEAST_DIFFERENCE_W * policy.problem.dt_s
     )
     for k in range(policy.share.size):
+        share = policy.share[k]
+        against = max(-tendency if share > previous_share else tendency, 0.0)
         cost = _cost_j(
-            power_demand_w, speed_mps, front_slip, rear_slip, previous_share, policy.share[k], vehicle, policy
+            power_demand_w, speed_mps, front_slip, rear_slip, previous_share, share, against, vehicle, policy
         )
         if cost < best_cost:
             best_cost = cost
-            best = policy.share[k]
+            best = share
     return best
 
 
@@ -172,10 +193,11 @@ def _cost_j(
     rear_slip: float,
     previous_share: float,
     share: float,
+    dearer: float,
     vehicle: VehicleParams,
     policy: PolicyTable,
 ) -> float:
-    """Right-hand side of eq. 31 for one share, J."""
+    """Right-hand side of eq. 31 for one share, J; `dearer` adds that part to the price of the change."""
     outcome = step_cost_and_next(
         power_demand_w, speed_mps, front_slip, rear_slip, share, vehicle, policy.problem
     )
@@ -185,7 +207,7 @@ def _cost_j(
     d, fd = locate(policy.slip_rear, outcome.slip_rear)
     e, fe = locate(policy.previous_share, share)
     follow_up = interpolate5(policy.expected_cost_j, a, fa, b, fb, c, fc, d, fd, e, fe)
-    switching = policy.switching_cost_j * abs(share - previous_share)
+    switching = policy.switching_cost_j * (1.0 + dearer) * abs(share - previous_share)
     if share != previous_share:
         switching += policy.switching_fixed_cost_j
     return outcome.cost_j + switching + policy.discount * follow_up

@@ -125,6 +125,9 @@ class Settings(NamedTuple):
     slew_down_nmps : fastest way of a torque to zero, N m/s (gates and limits may be faster)
     slew_regeneration_nmps : fastest growth of a regenerative torque, N m/s (friction fills in meanwhile)
     switching_power_w : `instantaneous*`: a change of the share has to save this much power
+    reversal_price : `sdp_lookahead`: how much dearer it is to take a change back that was made just now, as a multiple
+        of the policy's own price for each unit of share taken back; 0 is no dearer
+    reversal_s : time constant with which this is forgotten, > 0
     """
 
     strategy: int
@@ -142,6 +145,8 @@ class Settings(NamedTuple):
     slew_down_nmps: float
     slew_regeneration_nmps: float
     switching_power_w: float
+    reversal_price: float
+    reversal_s: float
 
 
 def default_settings(strategy: str = "equal") -> Settings:
@@ -162,6 +167,10 @@ def default_settings(strategy: str = "equal") -> Settings:
         slew_down_nmps=20000.0,  # from the peak torque to zero in one step of 10 ms
         slew_regeneration_nmps=4000.0,  # to full regeneration in 0.02 s
         switching_power_w=100.0,
+        # The demand's Markov chain does not know how long a demand has lasted, so that the policy takes a passing one
+        # for one that stays. Half of the power, sent back at once, is nine times as dear: five changes a minute less.
+        reversal_price=16.0,
+        reversal_s=0.5,
     )
 
 
@@ -174,6 +183,7 @@ class ControllerState(NamedTuple):
     decisions : decisions taken
     decision_age_s : time since the last one
     decided_share, applied_share : front share, 0..1
+    recent_change : sum of the changes of the decided share, each fading out with `reversal_s`
     front_motor_nm, rear_motor_nm : motor torque of each wheel of the axle in the last command
     front_total_nm, rear_total_nm : the same with the friction brake
     front_speed_radps, rear_speed_radps : mean wheel speed of the axle in the last step
@@ -188,6 +198,7 @@ class ControllerState(NamedTuple):
     decision_age_s: float
     decided_share: float
     applied_share: float
+    recent_change: float
     front_motor_nm: float
     rear_motor_nm: float
     front_total_nm: float
@@ -207,5 +218,5 @@ class ControllerState(NamedTuple):
 def initial_state() -> ControllerState:
     """The law's memory before its first step: at rest, cold, power split equally."""
     return ControllerState(
-        0, 0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False, False, 0.0, 0.0
+        0, 0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False, False, 0.0, 0.0
     )

@@ -17,6 +17,13 @@ A demand no source ever had still needs a next one, or the problem is not define
 nearest demand that was seen (of two, the smaller one in magnitude): an excursion beyond what was driven is taken to
 return the way it came, at a rate a driver can have. Staying put would be the other simple choice, but then the
 cost-to-go there would be that of driving at this power for ever.
+
+A driver in between
+-------------------
+The paper takes the power that following a cycle exactly would need (`cycle_demand: exact`): on a schedule with a point
+a second this is a saw-tooth that jumps once a second. Nobody's foot does, and how long a demand lasts is what the
+solution lives on. With `cycle_demand: driven` the driver model follows the cycle in a car that does what it is told,
+and what the pedals ask for is counted, jitter and all.
 """
 
 from __future__ import annotations
@@ -32,14 +39,17 @@ from numpy.typing import NDArray
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.mdp.problem import Problem
+from iwm_power_manager.mdp.problem import DRIVEN, Problem
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
+from iwm_power_manager.model.driver import DriverState, Trace, drive, sample
 from iwm_power_manager.vehicle import VehicleParams
 
 #: Rows with less data than this are called thin: 10 s at the paper's step.
 THIN_ROW_STEPS = 100
 #: A recording with a gap longer than this is taken as two recordings.
 MAX_GAP_S = 0.5
+#: A driver looks at the speedometer this often: the control step of nodes and simulation.
+DRIVER_STEP_S = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +137,46 @@ def cycle_source(cycle: Cycle, dt_s: float, vehicle: VehicleParams, weight: floa
     return Source(
         cycle.name, cycle.sha256, weight, (cycle_power_w(cycle, dt_s, vehicle),), (0.5 * (speed[1:] + speed[:-1]),)
     )
+
+
+@kernel
+def _driven(trace: Trace, dt_s, vehicle, power_w, speed_mps):
+    mass = equivalent_mass_kg(vehicle)
+    foot = DriverState(0.0)
+    speed = trace.speed_mps[0]
+    for k in range(power_w.size):
+        pedals, foot = drive(
+            foot,
+            speed,
+            trace.speed_mps[k],
+            trace.ahead_mps[k],
+            trace.ahead_mps2[k],
+            trace.grade[k],
+            dt_s,
+            vehicle,
+        )
+        power_w[k] = pedals.power_demand_w
+        speed_mps[k] = speed
+        force = pedals.power_demand_w / max(speed, vehicle.driver.power_speed_floor_mps)
+        force -= road_load_n(speed, trace.grade[k], vehicle.chassis)
+        speed = max(speed + force / mass * dt_s, 0.0)
+
+
+def driven_source(cycle: Cycle, dt_s: float, vehicle: VehicleParams, weight: float = 1.0) -> Source:
+    """What the driver model asks for on a cycle, in a car that delivers it (no slip, no lag), as a source of demand."""
+    trace = sample(cycle, DRIVER_STEP_S, vehicle.driver.preview_s)
+    power = np.empty(trace.speed_mps.size)
+    speed = np.empty(trace.speed_mps.size)
+    _driven(trace, DRIVER_STEP_S, vehicle, power, speed)
+    time = DRIVER_STEP_S * np.arange(power.size)
+    source = signal_source(cycle.name, time, power, dt_s, weight, speed)
+    return dataclasses.replace(source, sha256=cycle.sha256)
+
+
+def source_of(cycle: Cycle, problem: Problem, vehicle: VehicleParams, weight: float = 1.0) -> Source:
+    """A cycle as the source a problem asks for."""
+    make = driven_source if problem.cycle_demand == DRIVEN else cycle_source
+    return make(cycle, problem.dt_s, vehicle, weight)
 
 
 def signal_source(

@@ -43,6 +43,9 @@ POWER_ERRORS = {"wheel": POWER_ERROR_WHEEL, "road": POWER_ERROR_ROAD}
 ERROR_SQUARED, ERROR_ABSOLUTE, ERROR_LAGRANGE = range(3)
 ERROR_NORMS = {"squared": ERROR_SQUARED, "absolute": ERROR_ABSOLUTE, "lagrange": ERROR_LAGRANGE}
 
+#: What a cycle says about the demand: the power that following it exactly needs, or what a driver following it asks for.
+EXACT, DRIVEN = CYCLE_DEMANDS = ("exact", "driven")
+
 #: dynamic: slip is a state and obeys wheel rotation (eq. 11). quasi_steady: slip settles within a step at the value
 #: that carries the axle's force; slip is no state then.
 SLIP_DYNAMIC, SLIP_QUASI_STEADY = range(2)
@@ -100,6 +103,7 @@ class Problem:
     switching_fixed_cost_j : cost of any change at all
     demand_by_speed : whether the demand's Markov chain depends on the speed; the paper's does not
     speed_bandwidth_mps : with it, steps at speeds up to this far away count for a point of the speed axis, fading out
+    cycle_demand : exact: what following a cycle exactly would need; driven: what a driver asks for (`mdp.demand`)
     prior_steps : with it, the chain of all speeds counts as this many steps in every row, where data are few
     tolerance_j : solve until the cost-to-go is certified to be this close to the optimal one, J
     max_iterations : give up after this many policies
@@ -123,6 +127,7 @@ class Problem:
     switching_cost_j: float
     switching_fixed_cost_j: float
     demand_by_speed: bool
+    cycle_demand: str
     speed_bandwidth_mps: float
     prior_steps: float
     tolerance_j: float
@@ -190,6 +195,7 @@ _OPTIONAL = (
     "switching_cost_j",
     "switching_fixed_cost_j",
     "demand_by_speed",
+    "cycle_demand",
     "speed_bandwidth_mps",
     "prior_steps",
     "tolerance_j",
@@ -236,6 +242,7 @@ def problem_from(content: Any, path: Path | str) -> Problem:
         switching_cost_j=switching["switching_cost_j"],
         switching_fixed_cost_j=switching["switching_fixed_cost_j"],
         demand_by_speed=check_bool(path, "demand_by_speed", content.get("demand_by_speed", False)),
+        cycle_demand=check_choice(path, "cycle_demand", content.get("cycle_demand", EXACT), CYCLE_DEMANDS),
         speed_bandwidth_mps=check_number(
             path, "speed_bandwidth_mps", content.get("speed_bandwidth_mps", 0.5), 0.0, 50.0, above=True, unit="m/s"
         ),

@@ -214,7 +214,7 @@ def _quasi_steady_step(
 ) -> Step:
     battery = vehicle.battery
     dt = problem.dt_s
-    force = demand_force_n(power_demand_w, speed_mps, vehicle)
+    force = demand_force_n(power_demand_w, speed_mps, problem.friction, True, vehicle)
     power, missing = split_power_w(force, speed_mps, front_share, problem.friction, True, vehicle)
     shortfall = 0.0
     if power_demand_w > 0.0:
@@ -226,8 +226,9 @@ def _quasi_steady_step(
     resistance = road_load_n(speed_mps, 0.0, vehicle.chassis)
     after = max(speed_mps + dt * (given - resistance) / equivalent_mass_kg(vehicle), 0.0)
     # What is missing at rest still counts: a car that cannot pull away has not delivered its demand.
-    reached = given * max(speed_mps, vehicle.driver.power_speed_floor_mps)
-    return Step(power * dt + error_cost_j(power_demand_w, reached, problem), after, 0.0, 0.0, shortfall)
+    rolling = max(speed_mps, vehicle.driver.power_speed_floor_mps)
+    error = error_cost_j(force * rolling, given * rolling, problem)
+    return Step(power * dt + error, after, 0.0, 0.0, shortfall)
 
 
 @kernel

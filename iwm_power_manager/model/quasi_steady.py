@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import chemical_power_w
-from iwm_power_manager.model.chassis import equivalent_mass_kg, normal_forces_n, road_load_n
+from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, normal_forces_n, road_load_n
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
 from iwm_power_manager.model.tyre import slip_at_friction, wheel_speed_at_slip
 from iwm_power_manager.vehicle import VehicleParams
@@ -100,6 +100,20 @@ def split_power_w(
 
 
 @kernel
-def demand_force_n(power_demand_w: float, speed_mps: float, vehicle: VehicleParams) -> float:
-    """Road force a power demand stands for, N; eq. 16 with its speed floor."""
-    return power_demand_w / max(speed_mps, vehicle.driver.power_speed_floor_mps)
+def demand_force_n(
+    power_demand_w: float, speed_mps: float, friction: float, slip_aware: bool, vehicle: VehicleParams
+) -> float:
+    """Road force a power demand at the wheels stands for, N: torque by eq. 16 with its speed floor, both axles alike.
+
+    A wheel that slips turns faster than it rolls, so that the same power is less torque: a tenth less near the grip of
+    a slippery road. Without `slip_aware` the wheels roll.
+    """
+    floor = vehicle.driver.power_speed_floor_mps
+    force = power_demand_w / max(speed_mps, floor)
+    if not slip_aware:
+        return force
+    used = force / (vehicle.chassis.mass_kg * GRAVITY_MPS2)
+    most = USABLE_FRICTION * friction * vehicle.tyre.peak_factor
+    slip = slip_at_friction(min(max(used, -most), most), friction, vehicle.tyre)
+    rim_speed = vehicle.wheel.radius_m * wheel_speed_at_slip(slip, speed_mps, vehicle.wheel.radius_m)
+    return power_demand_w / max(rim_speed, floor)

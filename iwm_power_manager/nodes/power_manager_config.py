@@ -30,6 +30,8 @@ _LAW_RANGES = {
     "slew_down_nmps": (100.0, 1e6, "fastest way of a motor torque to zero, N m/s"),
     "slew_regeneration_nmps": (10.0, 1e6, "fastest growth of a regenerative torque, N m/s; friction fills in"),
     "switching_power_w": (0.0, 1e5, "instantaneous_slip: a change of the share has to save this much, W"),
+    "reversal_price": (0.0, 1000.0, "sdp_lookahead: how much dearer it is to take a change of the share back at once"),
+    "reversal_s": (0.01, 60.0, "time constant with which reversal_price is forgotten, s"),
 }
 
 SPECS = (

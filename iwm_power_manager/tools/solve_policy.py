@@ -32,8 +32,8 @@ from iwm_power_manager.mdp.demand import (
     DemandChain,
     Source,
     chain_of,
-    cycle_source,
     signal_source,
+    source_of,
 )
 from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
 from iwm_power_manager.mdp.problem import Problem, load_problem
@@ -166,7 +166,7 @@ def _solve(options: argparse.Namespace) -> int:
     targets = _targets(Path(options.output), vehicle, problem, frictions)
     say = _silent if options.quiet else print
 
-    sources = _sources(options, problem.dt_s, vehicle)
+    sources = _sources(options, problem, vehicle)
     chain = chain_of(problem, sources)
     say(_problem_text(problem, vehicle))
     say(_demand_text(chain, sources, problem.dt_s))
@@ -204,8 +204,8 @@ def _problem(options: argparse.Namespace) -> Problem:
     return dataclasses.replace(problem, discount=discount)
 
 
-def _sources(options: argparse.Namespace, dt_s: float, vehicle: Vehicle) -> list[Source]:
-    sources = [cycle_source(load_cycle(resolve(path)), dt_s, vehicle.params) for path in options.cycle]
+def _sources(options: argparse.Namespace, problem: Problem, vehicle: Vehicle) -> list[Source]:
+    sources = [source_of(load_cycle(resolve(path)), problem, vehicle.params) for path in options.cycle]
     mapping = load_mapping(resolve(options.mapping) if options.mapping else None) if options.bag else None
     for path in options.bag:
         drive = read_signal(path, mapping, vehicle.params)
@@ -215,7 +215,12 @@ def _sources(options: argparse.Namespace, dt_s: float, vehicle: Vehicle) -> list
             print(f"solve_policy: warning: {path}: {drive.bad_messages} bad messages left out", file=sys.stderr)
         sources.append(
             signal_source(
-                Path(path).name, drive.time_s, drive.power_demand_w, dt_s, options.bag_weight, drive.speed_mps
+                Path(path).name,
+                drive.time_s,
+                drive.power_demand_w,
+                problem.dt_s,
+                options.bag_weight,
+                drive.speed_mps,
             )
         )
     return sources + [transitions_source(path, dt_s, options.bag_weight) for path in options.transitions]

@@ -149,7 +149,7 @@ def parser() -> argparse.ArgumentParser:
         "--switching-cost",
         type=_number(0.0, 1e6),
         metavar="J",
-        help="preview: price of a change of the share (default: that of the policy in use)",
+        help="preview: price of moving all the power to the other axle, in proportion (default: that of the policy in use)",
     )
     law.add_argument(
         "--assumed-friction",
@@ -334,7 +334,7 @@ def _with_policy(case: Case, policy: str, switching_cost_j: float | None) -> Cas
     if case.strategy != "preview":
         return case
     if switching_cost_j is not None:
-        return dataclasses.replace(case, switching_fixed_cost_j=switching_cost_j)
+        return dataclasses.replace(case, switching_cost_j=switching_cost_j)
     problem = cases.policy_of(policy).problem
     return dataclasses.replace(
         case, switching_cost_j=problem.switching_cost_j, switching_fixed_cost_j=problem.switching_fixed_cost_j

@@ -335,7 +335,7 @@ def _frontier(base: Case, priced: Mapping[float, str]) -> list[Case]:
         for power in FRONTIER_POWERS_W
     ]
     bound = [
-        replace(base, strategy="preview", label=f"preview|{cost:g} J", switching_fixed_cost_j=cost)
+        replace(base, strategy="preview", label=f"preview|{cost:g} J", switching_cost_j=cost)
         for cost in FRONTIER_COSTS_J
     ]
     ours = [

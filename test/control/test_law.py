@@ -152,6 +152,7 @@ TUNINGS = st.builds(
     slip_target=st.sampled_from((0.15, 0.08)),
     slip_filter_s=st.sampled_from((0.0, 0.02)),
     slip_speed_floor_mps=st.sampled_from((0.5, 1.0)),
+    reversal_s=st.sampled_from((0.5, 0.01)),
     slew_up_nmps=st.sampled_from((1600.0, 300.0)),
     slew_down_nmps=st.sampled_from((20000.0, 900.0)),
     slew_regeneration_nmps=st.sampled_from((4000.0, 500.0)),
@@ -169,6 +170,7 @@ MEMORIES = st.builds(
     decision_age_s=AGES,
     decided_share=SHARES,
     applied_share=SHARES,
+    recent_change=st.floats(-2.0, 2.0),
     front_motor_nm=TORQUES,
     rear_motor_nm=TORQUES,
     front_speed_radps=WHEELS,
@@ -362,7 +364,11 @@ def it_does_what_the_plain_law_does(case):
         case.before.decision_age_s + 1.5 * case.m.dt_s >= case.settings.decision_period_s
     )
     assert after.decisions == case.before.decisions + taken
-    assert after.decision_age_s == near(0.0 if taken else case.before.decision_age_s + case.m.dt_s)
+    age = case.before.decision_age_s + case.m.dt_s
+    assert after.decision_age_s == near(0.0 if taken else age)
+    fading = math.exp(-age / case.settings.reversal_s) if taken else 1.0
+    moved = after.decided_share - case.before.decided_share
+    assert after.recent_change == near(case.before.recent_change * fading + moved)
 
 
 CHECKS = (

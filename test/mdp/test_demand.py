@@ -20,12 +20,16 @@ from iwm_power_manager.mdp.demand import (
     cycle_power_w,
     cycle_source,
     demand_chain,
+    driven_source,
     nearest_bin,
     signal_source,
+    source_of,
 )
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
+from oracles.driver import look
+from oracles.physics import road_load
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
 AXIS = np.array([-2000.0, -1000.0, 0.0, 1000.0, 2000.0])
@@ -135,6 +139,42 @@ def test_a_grade_costs_its_weight_and_a_standing_car_nothing():
     expected = 800.0 * 9.81 * 10.0 * (0.1 * cosine + 0.01 * (cosine - 1.0))
     assert uphill - level == pytest.approx(np.full(10, expected))
     assert np.all(cycle_power_w(make_cycle("made", [0, 1], [0.0, 0.0], [0.1, 0.1]), 0.1, CAR) == 0.0)
+
+
+def test_a_driven_cycle_asks_for_what_the_plain_driver_asks_for_in_a_car_that_obeys():
+    cycle = make_cycle("made", [0, 4, 6, 9, 12], [0.0, 8.0, 8.0, 0.0, 0.0], [0.0, 0.0, 0.05, 0.05, 0.0])
+    source = driven_source(cycle, 0.1, CAR)
+    dt, ahead_s, mass = 0.01, CAR.driver.preview_s, 800.0 + 4.0 * CAR.wheel.inertia_kgm2 / CAR.wheel.radius_m**2
+
+    def trace(time):
+        return float(np.interp(time, cycle.time_s, cycle.speed_mps))
+
+    speed, integral, powers, speeds = 0.0, 0.0, [], []
+    for k in range(1200):
+        now = k * dt
+        slope = (trace(now + ahead_s + dt / 2) - trace(now + ahead_s - dt / 2)) / dt
+        grade = float(np.interp(now, cycle.time_s, cycle.grade))
+        *_, power, integral = look(integral, speed, trace(now), trace(now + ahead_s), slope, grade, dt, CAR)
+        powers.append(power)
+        speeds.append(speed)
+        force = power / max(speed, CAR.driver.power_speed_floor_mps) - road_load(speed, grade, CAR.chassis)
+        speed = max(speed + force / mass * dt, 0.0)
+    assert source.sequences[0] == pytest.approx(powers[::10], rel=1e-6, abs=1e-3)
+    assert source.speeds[0] == pytest.approx(speeds[::10], rel=1e-6, abs=1e-6)
+    assert np.abs(source.speeds[0] - np.interp(0.1 * np.arange(120), cycle.time_s, cycle.speed_mps)).max() < 0.5
+
+
+def test_a_problem_says_whose_demand_it_takes_of_a_cycle():
+    cycle = load_cycle(share_path("config/cycles/nycc.csv"))
+    exact = source_of(cycle, _by_speed(cycle_demand="exact", dt_s=0.5), CAR, 2.0)
+    driven = source_of(cycle, _by_speed(cycle_demand="driven", dt_s=0.5), CAR, 2.0)
+    assert exact.sequences[0].tolist() == cycle_power_w(cycle, 0.5, CAR).tolist()
+    assert driven.sequences[0].tolist() == driven_source(cycle, 0.5, CAR).sequences[0].tolist()
+    assert (driven.name, driven.sha256, driven.weight) == (exact.name, exact.sha256, exact.weight) == (
+        cycle.name,
+        cycle.sha256,
+        2.0,
+    )
 
 
 def test_the_standard_cycles_visit_every_demand_of_the_paper_s_axis():

@@ -176,7 +176,7 @@ def test_every_step_is_finite_and_possible(power, speed, front, rear, share, fri
 
 def test_a_quasi_steady_step_costs_what_the_settled_split_draws():
     params = _params(slip_model="quasi_steady", error_norm="absolute")
-    force = demand_force_n(6000.0, 12.0, CAR.params)
+    force = demand_force_n(6000.0, 12.0, params.friction, True, CAR.params)
     power, missing = split_power_w(force, 12.0, 0.3, params.friction, True, CAR.params)
     outcome = step_cost_and_next(6000.0, 12.0, 0.0, 0.0, 0.3, CAR.params, params)
     assert missing == 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from iwm_power_manager.model.quasi_steady import axle_power_w, demand_force_n, split_power_w
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
-from oracles.physics import axle_w
+from oracles.physics import axle_w, slip_for
 from oracles.splits import split_w
 
 CARS = {
@@ -70,6 +72,17 @@ def test_what_one_axle_cannot_give_goes_to_the_other():
 
 
 def test_a_demand_stands_for_a_force_at_no_less_than_the_floor_speed():
-    assert demand_force_n(1000.0, 20.0, CAR) == 50.0
-    assert demand_force_n(1000.0, 0.0, CAR) == 1000.0
-    assert demand_force_n(-1000.0, 0.5, CAR) == -1000.0
+    for slip_aware, near in ((False, 0.0), (True, 0.02)):
+        assert demand_force_n(1000.0, 20.0, 0.9, slip_aware, CAR) == pytest.approx(50.0, rel=near)
+        assert demand_force_n(1000.0, 0.0, 0.9, slip_aware, CAR) == 1000.0
+        assert demand_force_n(-1000.0, 0.5, 0.9, slip_aware, CAR) == pytest.approx(-1000.0, rel=near)
+
+
+@given(st.floats(-20e3, 20e3), st.floats(2.0, 40.0), st.sampled_from([0.9, 0.5, 0.2]))
+def test_a_demand_s_force_is_that_of_wheels_that_slip_for_it(power, speed, friction):
+    force = demand_force_n(power, speed, friction, True, CAR)
+    peak = friction * CAR.tyre.peak_factor
+    used = min(abs(power) / speed / (800.0 * 9.81), 0.99 * peak)
+    slip = math.copysign(slip_for(used, friction, CAR.tyre), power)
+    rim = speed / (1.0 - slip) if power > 0.0 else speed * (1.0 + slip)
+    assert force * rim == pytest.approx(power, rel=1e-6, abs=1e-6)

@@ -1,4 +1,4 @@
-"""The simulated driver in plain Python: what force is wanted, which pedal gives it, what the integral does."""
+"""The driver in plain Python: what force is wanted, which pedal gives it, what the integral does."""
 
 from __future__ import annotations
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from oracles.physics import axle_w, battery_w, normal_forces, road_load, torque_limit
-from oracles.step import electrical_w
+from oracles.physics import axle_w, battery_w, normal_forces, road_load, slip_for, torque_limit
+from oracles.step import G, electrical_w
 
 MISSING_PRICE = 20.0
 TELLS_APART_W = 1e-3
@@ -45,6 +45,11 @@ def cheapest(demand, speed, previous, friction, slip_aware, switching, vehicle, 
     """Least battery power, what is missing priced, a change of share worth it only beyond `switching`."""
     rolling = max(speed, vehicle.driver.power_speed_floor_mps)
     force = demand / rolling
+    if slip_aware:
+        used = min(abs(force) / (vehicle.chassis.mass_kg * G), 0.99 * friction * vehicle.tyre.peak_factor)
+        slip = slip_for(used, friction, vehicle.tyre)
+        rim = speed / (1.0 - slip) if demand > 0.0 else speed * (1.0 - slip)
+        force = demand / max(rim, vehicle.driver.power_speed_floor_mps)
 
     def price(share):
         power, missing = split_w(force, rolling, share, friction, slip_aware, vehicle)
@@ -70,14 +75,16 @@ def interpolated(axes, table, point):
     return float(RegularGridInterpolator([axes[i] for i in kept], values)(inside)[0]) if kept else float(values)
 
 
-def bellman(point, previous, table, outcome):
+def bellman(point, previous, table, outcome, tendency=0.0):
     """Cost of each share: step, change, and what follows (eq. 31). `outcome(share)` is the step's (cost, v, f, r)."""
     axes = (table.power_w, table.speed_mps, table.slip_front, table.slip_rear, table.previous_share)
     costs = {}
     for share in (previous, *table.share):
         cost, speed, front, rear = outcome(share)
         follow_up = interpolated(axes, table.expected_cost_j, (point[0], speed, front, rear, share))
-        changed = table.switching_cost_j * abs(share - previous) + table.switching_fixed_cost_j * (share != previous)
+        move = share - previous
+        back = abs(move * tendency) if move * tendency < 0.0 else 0.0
+        changed = table.switching_cost_j * (abs(move) + back) + table.switching_fixed_cost_j * (move != 0.0)
         costs.setdefault(share, cost + changed + table.discount * follow_up)
     costs[previous] -= TELLS_APART_W * table.problem.dt_s
     return costs

@@ -14,8 +14,8 @@ from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle, with_params
 from iwm_sim import closed_loop, plant
-from iwm_sim.closed_loop import COLUMNS, Noise, run, sample
-from iwm_sim.driver import DriverState, drive
+from iwm_sim.closed_loop import COLUMNS, Noise, run
+from iwm_power_manager.model.driver import DriverState, drive, sample
 from iwm_sim.metrics import longest_s, measure
 from oracles.plant import imbalance_j, open_circuit_v
 

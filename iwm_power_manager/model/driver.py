@@ -1,6 +1,6 @@
-"""The simulated driver: follows a speed trace with two pedals, and what the pedals ask for.
+"""A driver: follows a speed trace with two pedals, and what the pedals ask for.
 
-The driver looks a little ahead, knows the car's mass and road load, and corrects the speed error with a PI controller
+The simulation drives with it, and the offline tool learns from it what a driver demands on a cycle. The driver looks a little ahead, knows the car's mass and road load, and corrects the speed error with a PI controller
 whose integral stops while a pedal is fully pressed. What the pedals mean stands in `iwm_power_manager.model.pedals`.
 """
 
@@ -8,6 +8,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.pedals import full_braking_w, full_power_w, pedal_power_w
@@ -18,6 +22,40 @@ from iwm_power_manager.vehicle import VehicleParams
 STANDING_TRACE_MPS = 0.2
 STANDING_CAR_MPS = 0.3
 HOLDING_BRAKE = 0.1
+
+
+class Trace(NamedTuple):
+    """A cycle sampled at the control step, as the driver sees it; arrays of equal length.
+
+    Attributes
+    ----------
+    speed_mps : now
+    ahead_mps, ahead_mps2 : speed and slope `preview_s` from now
+    grade : rise over run, now
+    """
+
+    speed_mps: NDArray[np.float64]
+    ahead_mps: NDArray[np.float64]
+    ahead_mps2: NDArray[np.float64]
+    grade: NDArray[np.float64]
+
+
+def sample(cycle: Cycle, dt_s: float, preview_s: float) -> Trace:
+    """The trace at 0, dt, 2 dt ... up to the cycle's end, linear between its points."""
+    start = cycle.time_s[0]
+    steps = int(np.floor((cycle.time_s[-1] - start) / dt_s + 1e-9))
+    time = start + dt_s * np.arange(steps)
+
+    def speed(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.interp(at, cycle.time_s, cycle.speed_mps)
+
+    half = 0.5 * dt_s
+    return Trace(
+        speed(time),
+        speed(time + preview_s),
+        (speed(time + preview_s + half) - speed(time + preview_s - half)) / dt_s,
+        np.interp(time, cycle.time_s, cycle.grade),
+    )
 
 
 class DriverState(NamedTuple):

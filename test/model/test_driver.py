@@ -1,4 +1,4 @@
-"""The simulated driver against plain Python, and whether it drives well."""
+"""The driver against plain Python, and whether it drives well."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
+from iwm_power_manager.model.driver import DriverState, drive
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
-from iwm_sim.driver import DriverState, drive
 from oracles.driver import look
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), "none").params
