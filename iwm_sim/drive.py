@@ -20,12 +20,12 @@ from iwm_power_manager.control.types import Wheels
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write, read_bytes
+from iwm_power_manager.model.driver import DriverState, Pedals, drive, sample
 from iwm_power_manager.model.pedals import full_braking_w
 from iwm_power_manager.model.tyre import slip_ratio
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import plant
 from iwm_sim.closed_loop import COLUMNS, Run
-from iwm_power_manager.model.driver import DriverState, Pedals, drive, sample
 
 #: Columns of a run's series that only the control law knows; a drive leaves them empty (NaN).
 LAW_COLUMNS = ("decided_share", "front_share", "gate", "limits", "front_power_w", "rear_power_w")

@@ -168,7 +168,7 @@ def driven_source(cycle: Cycle, dt_s: float, vehicle: VehicleParams, weight: flo
     power = np.empty(trace.speed_mps.size)
     speed = np.empty(trace.speed_mps.size)
     _driven(trace, DRIVER_STEP_S, vehicle, power, speed)
-    time = DRIVER_STEP_S * np.arange(power.size)
+    time = DRIVER_STEP_S * np.arange(power.size, dtype=np.float64)
     source = signal_source(cycle.name, time, power, dt_s, weight, speed)
     return dataclasses.replace(source, sha256=cycle.sha256)
 

@@ -43,7 +43,7 @@ POWER_ERRORS = {"wheel": POWER_ERROR_WHEEL, "road": POWER_ERROR_ROAD}
 ERROR_SQUARED, ERROR_ABSOLUTE, ERROR_LAGRANGE = range(3)
 ERROR_NORMS = {"squared": ERROR_SQUARED, "absolute": ERROR_ABSOLUTE, "lagrange": ERROR_LAGRANGE}
 
-#: What a cycle says about the demand: the power that following it exactly needs, or what a driver following it asks for.
+#: What a cycle says about the demand: the power that following it exactly needs, or what a driver asks for.
 EXACT, DRIVEN = CYCLE_DEMANDS = ("exact", "driven")
 
 #: dynamic: slip is a state and obeys wheel rotation (eq. 11). quasi_steady: slip settles within a step at the value
@@ -100,6 +100,8 @@ class Problem:
     discount : gamma, 0 < gamma < 1
     alpha, power_error, error_norm, slip_model, skid_avoidance, critical_slip : see `ProblemParams`, codes by name
     switching_cost_j : cost of moving the whole power from one axle to the other, proportional to |change of share|
+    switching_cost_by_friction : pairs (friction, switching_cost_j), linear between them and constant beyond;
+        empty where it is the same on every road
     switching_fixed_cost_j : cost of any change at all
     demand_by_speed : whether the demand's Markov chain depends on the speed; the paper's does not
     speed_bandwidth_mps : with it, steps at speeds up to this far away count for a point of the speed axis, fading out
@@ -125,6 +127,7 @@ class Problem:
     skid_avoidance: str
     critical_slip: float
     switching_cost_j: float
+    switching_cost_by_friction: tuple[tuple[float, float], ...]
     switching_fixed_cost_j: float
     demand_by_speed: bool
     cycle_demand: str
@@ -145,6 +148,14 @@ class Problem:
             skid_avoidance=SKID_AVOIDANCE[self.skid_avoidance],
             critical_slip=self.critical_slip,
         )
+
+    def on_road(self, friction: float) -> Problem:
+        """The problem as it is on one road: `switching_cost_j` taken from `switching_cost_by_friction`."""
+        if not self.switching_cost_by_friction:
+            return self
+        frictions, costs = zip(*self.switching_cost_by_friction, strict=True)
+        price = float(np.interp(friction, frictions, costs))
+        return dataclasses.replace(self, switching_cost_j=price, switching_cost_by_friction=())
 
     @property
     def previous_shares(self) -> NDArray[np.float64]:
@@ -193,6 +204,7 @@ _OPTIONAL = (
     "skid_avoidance",
     "critical_slip",
     "switching_cost_j",
+    "switching_cost_by_friction",
     "switching_fixed_cost_j",
     "demand_by_speed",
     "cycle_demand",
@@ -240,6 +252,7 @@ def problem_from(content: Any, path: Path | str) -> Problem:
         skid_avoidance=check_choice(path, "skid_avoidance", content.get("skid_avoidance", "braking"), SKID_AVOIDANCE),
         critical_slip=check_number(path, "critical_slip", content.get("critical_slip", 0.2), 0.01, 1.0),
         switching_cost_j=switching["switching_cost_j"],
+        switching_cost_by_friction=_by_friction(path, content.get("switching_cost_by_friction", [])),
         switching_fixed_cost_j=switching["switching_fixed_cost_j"],
         demand_by_speed=check_bool(path, "demand_by_speed", content.get("demand_by_speed", False)),
         cycle_demand=check_choice(path, "cycle_demand", content.get("cycle_demand", EXACT), CYCLE_DEMANDS),
@@ -260,14 +273,32 @@ def _check_combination(problem: Problem, path: Path | str) -> None:
             axis = getattr(problem, key)
             if axis.size != 1 or axis[0] != 0.0:
                 raise ConfigError(path, key, "is no state with slip_model quasi_steady", "[0]")
+    if problem.switching_cost_by_friction and problem.switching_cost_j > 0.0:
+        raise ConfigError(path, "switching_cost_by_friction", "stands beside switching_cost_j", "one of them")
     if not problem.previous_share:
-        for key in ("switching_cost_j", "switching_fixed_cost_j"):
-            if getattr(problem, key) > 0.0:
+        for key in ("switching_cost_j", "switching_cost_by_friction", "switching_fixed_cost_j"):
+            if getattr(problem, key) not in (0.0, ()):
                 raise ConfigError(path, key, "needs previous_share: true", "0, or previous_share: true")
     pairs = int(np.prod([float(n) for n in problem.shape[:4]])) * problem.share.size
     if pairs > MAX_PAIRS:
         problem_text = f"has {pairs:.3g} pairs of state and control"
         raise ConfigError(path, "", problem_text, f"<= {MAX_PAIRS:.3g}: use coarser axes")
+
+
+def _by_friction(path: Path | str, value: Any) -> tuple[tuple[float, float], ...]:
+    key = "switching_cost_by_friction"
+    if not isinstance(value, list | tuple):
+        raise ConfigError(path, key, f"{value!r} is no list of pairs", "[[friction, J], ...]")
+    pairs: list[tuple[float, float]] = []
+    for i, pair in enumerate(value):
+        where = f"{key}[{i}]"
+        if not isinstance(pair, list | tuple) or len(pair) != 2:
+            raise ConfigError(path, where, f"{pair!r} is no pair", "[friction, J]")
+        friction = check_number(path, where, pair[0], 0.01, 2.0)
+        if pairs and friction <= pairs[-1][0]:
+            raise ConfigError(path, where, f"{friction:g} does not increase", f"> {pairs[-1][0]:g}")
+        pairs.append((friction, check_number(path, where, pair[1], 0.0, 1e6, unit="J")))
+    return tuple(pairs)
 
 
 def read_axis(file: Path | str, key: str, value: Any, low: float, high: float, unit: str) -> NDArray[np.float64]:

@@ -1,7 +1,8 @@
 """A driver: follows a speed trace with two pedals, and what the pedals ask for.
 
-The simulation drives with it, and the offline tool learns from it what a driver demands on a cycle. The driver looks a little ahead, knows the car's mass and road load, and corrects the speed error with a PI controller
-whose integral stops while a pedal is fully pressed. What the pedals mean stands in `iwm_power_manager.model.pedals`.
+The simulation drives with it, and the offline tool learns from it what a driver demands on a cycle. The driver looks a
+little ahead, knows the car's mass and road load, and corrects the speed error with a PI controller whose integral stops
+while a pedal is fully pressed. What the pedals mean stands in `iwm_power_manager.model.pedals`.
 """
 
 from __future__ import annotations

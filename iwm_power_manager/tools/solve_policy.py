@@ -223,7 +223,7 @@ def _sources(options: argparse.Namespace, problem: Problem, vehicle: Vehicle) ->
                 drive.speed_mps,
             )
         )
-    return sources + [transitions_source(path, dt_s, options.bag_weight) for path in options.transitions]
+    return sources + [transitions_source(path, problem.dt_s, options.bag_weight) for path in options.transitions]
 
 
 def _targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequence[float]) -> list[Path]:
@@ -255,6 +255,7 @@ def solve_one(
 ) -> Solved:
     """Solve for one road, write the policy, and say what it took."""
     started = time.perf_counter()
+    problem = problem.on_road(friction)
     with _Progress(f"friction {friction:g}", problem.tolerance_j, quiet) as progress:
         model = build_model(problem, vehicle.params, friction, chain.matrix)
         built = time.perf_counter()
@@ -359,9 +360,15 @@ def _problem_text(problem: Problem, vehicle: Vehicle) -> str:
         f"(power, speed, slip front, slip rear, previous share), {problem.share.size} controls\n"
         f"step {problem.dt_s:g} s, discount {problem.discount:g} (horizon {horizon:.3g} s), "
         f"alpha {problem.alpha:g}, power error at the {problem.power_error} ({problem.error_norm}), slip "
-        f"{problem.slip_model}, skid avoidance {problem.skid_avoidance}, switching {problem.switching_cost_j:g} J "
+        f"{problem.slip_model}, skid avoidance {problem.skid_avoidance}, switching {_price_text(problem)} "
         f"+ {problem.switching_fixed_cost_j:g} J for any change"
     )
+
+
+def _price_text(problem: Problem) -> str:
+    if not problem.switching_cost_by_friction:
+        return f"{problem.switching_cost_j:g} J"
+    return ", ".join(f"{price:g} J at friction {friction:g}" for friction, price in problem.switching_cost_by_friction)
 
 
 def _demand_text(chain: DemandChain, sources: Sequence[Source], dt_s: float) -> str:

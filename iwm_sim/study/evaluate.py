@@ -149,7 +149,7 @@ def parser() -> argparse.ArgumentParser:
         "--switching-cost",
         type=_number(0.0, 1e6),
         metavar="J",
-        help="preview: price of moving all the power to the other axle, in proportion (default: that of the policy in use)",
+        help="preview: price of moving all the power to the other axle (default: that of the policy in use)",
     )
     law.add_argument(
         "--assumed-friction",

@@ -44,7 +44,7 @@ PAPER_GRID, PAPER_GRID_WITHOUT = "paper", "paper_without_skid_avoidance"
 PAPER_PERIOD_S = 0.1
 
 #: Power a change has to save, W, of the strongest rival in the tables.
-RIVAL_SWITCHING_W = (60.0, 100.0)
+RIVAL_SWITCHING_W = (40.0, 60.0, 100.0)
 
 #: The switching frontier: cycle and road, and the prices along it.
 FRONTIER_CYCLE, FRONTIER_FRICTION = "udds", 0.9

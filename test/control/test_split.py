@@ -107,7 +107,7 @@ def test_at_equal_cost_the_share_stays():
     )
     car = CARS[0]._replace(motor=motor)
     assert cheapest_share(4000.0, 12.0, 0.37, 0.9, False, 0.0, car, TABLE) == 0.37
-    assert decide(4000.0, 12.0, 0.0, 0.0, 0.37, 0.9, 0, default_settings("instantaneous"), car, TABLE) == 0.37
+    assert decide(4000.0, 12.0, 0.0, 0.0, 0.37, 0.0, 0.9, 0, default_settings("instantaneous"), car, TABLE) == 0.37
 
 
 def test_a_change_is_made_for_a_saving_beyond_rounding():
@@ -148,7 +148,12 @@ def test_a_share_from_a_table_stays_within_0_and_1():
 
 @settings(max_examples=60)
 @given(
-    POWER, st.floats(0.0, 30.0), st.floats(-0.15, 0.15), st.floats(-0.15, 0.15), SHARE, st.sampled_from([0.0, -7.0, 2.5])
+    POWER,
+    st.floats(0.0, 30.0),
+    st.floats(-0.15, 0.15),
+    st.floats(-0.15, 0.15),
+    SHARE,
+    st.sampled_from([0.0, -7.0, 2.5]),
 )
 def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, rear, previous, tendency):
     def outcome(share):
@@ -242,11 +247,8 @@ def test_every_strategy_is_behind_its_name():
 
 
 def test_a_strategy_the_law_does_not_know_is_equal_split():
-<<<<<<< HEAD
-    assert decide(1500.0, 12.0, 0.01, -0.02, 0.3, 0.9, 0, default_settings()._replace(strategy=99), CAR, TABLE) == 0.5
-=======
-    assert decide(5000.0, 12.0, 0.0, 0.0, 0.3, 0.0, 0.9, 0, default_settings()._replace(strategy=99), CAR, TABLE) == 0.5
->>>>>>> 3d80746 (Split: a change just made is dear to take back; demand learned from a driver; force of a demand knows the slip)
+    unknown = default_settings()._replace(strategy=99)
+    assert decide(1500.0, 12.0, 0.01, -0.02, 0.3, 0.0, 0.9, 0, unknown, CAR, TABLE) == 0.5
 
 
 def test_the_preview_plays_its_schedule_and_holds_the_last_entry():

@@ -161,7 +161,7 @@ def test_a_driven_cycle_asks_for_what_the_plain_driver_asks_for_in_a_car_that_ob
         speed = max(speed + force / mass * dt, 0.0)
     assert source.sequences[0] == pytest.approx(powers[::10], rel=1e-6, abs=1e-3)
     assert source.speeds[0] == pytest.approx(speeds[::10], rel=1e-6, abs=1e-6)
-    assert np.abs(source.speeds[0] - np.interp(0.1 * np.arange(120), cycle.time_s, cycle.speed_mps)).max() < 0.5
+    assert np.abs(source.speeds[0] - np.interp(0.1 * np.arange(120), cycle.time_s, cycle.speed_mps)).max() < 1.0
 
 
 def test_a_problem_says_whose_demand_it_takes_of_a_cycle():

@@ -37,6 +37,19 @@ def test_the_fine_grid_has_the_previous_share_and_a_price_on_changing_it():
     assert np.array_equal(cost, cost.T)
 
 
+def test_the_price_of_a_change_may_depend_on_the_road():
+    content = {**read_yaml(FINE), "switching_cost_j": 0, "switching_cost_by_friction": [[0.2, 50], [0.6, 30]]}
+    problem = problem_from(content, "g.yaml")
+    prices = {mu: problem.on_road(mu).switching_cost_j for mu in (0.1, 0.2, 0.4, 0.6, 0.9)}
+    assert prices == pytest.approx({0.1: 50.0, 0.2: 50.0, 0.4: 40.0, 0.6: 30.0, 0.9: 30.0})
+    there = problem.on_road(0.4)
+    assert there.on_road(0.9) is there
+    same = load_problem(FINE)
+    assert same.on_road(0.4) is same
+    with pytest.raises(ConfigError, match="switching_cost_by_friction: stands beside switching_cost_j"):
+        problem_from({**content, "switching_cost_j": 1}, "g.yaml")
+
+
 def test_a_fixed_switching_cost_falls_due_with_any_change():
     content = {**read_yaml(FINE), "share": [0, 0.5, 1], "switching_cost_j": 10, "switching_fixed_cost_j": 3}
     expected = [[0.0, 8.0, 13.0], [8.0, 0.0, 8.0], [13.0, 8.0, 0.0]]
@@ -106,6 +119,13 @@ def test_every_axis_may_have_a_single_point():
         ({"slip_front": {"mirrored": [0, 0.1], "step": 1}}, "slip_front.step: is an unknown key"),
         ({"slip_model": "quasi_steady"}, "slip_front: is no state with slip_model quasi_steady; allowed: [0]"),
         ({"switching_cost_j": 10}, "switching_cost_j: needs previous_share: true"),
+        ({"switching_cost_by_friction": [[0.5, 10]]}, "switching_cost_by_friction: needs previous_share: true"),
+        ({"switching_cost_by_friction": 7}, "switching_cost_by_friction: 7 is no list of pairs"),
+        ({"switching_cost_by_friction": [[0.5]]}, "switching_cost_by_friction[0]: [0.5] is no pair"),
+        ({"switching_cost_by_friction": [[0.5, 1], [0.5, 2]]}, "[1]: 0.5 does not increase; allowed: > 0.5"),
+        ({"switching_cost_by_friction": [[5, 1]]}, "friction[0]: 5 is out of range; allowed: 0.01 to 2"),
+        ({"switching_cost_by_friction": [[0.5, -1]]}, "friction[0]: -1 is out of range; allowed: 0 to 1e+06 J"),
+        ({"cycle_demand": "guessed"}, "cycle_demand: 'guessed' is unknown"),
         ({"switching_fixed_cost_j": -1}, "switching_fixed_cost_j: -1 is out of range"),
         (
             {"power_w": {"from": 0, "to": 900, "step": 1}, "speed_mps": {"from": 0, "to": 90, "step": 0.5}},

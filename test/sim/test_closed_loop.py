@@ -8,6 +8,7 @@ import pytest
 from iwm_power_manager.control import law
 from iwm_power_manager.control.types import GATE_MODE_LIMITER, GATE_MODE_OFF, default_settings, initial_state
 from iwm_power_manager.cycle import load_cycle, make_cycle
+from iwm_power_manager.model.driver import DriverState, drive, sample
 from iwm_power_manager.model.pedals import full_braking_w
 from iwm_power_manager.model.tyre import slip_ratio
 from iwm_power_manager.policy import empty_table
@@ -15,7 +16,6 @@ from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle, with_params
 from iwm_sim import closed_loop, plant
 from iwm_sim.closed_loop import COLUMNS, Noise, run
-from iwm_power_manager.model.driver import DriverState, drive, sample
 from iwm_sim.metrics import longest_s, measure
 from oracles.plant import imbalance_j, open_circuit_v
 
