@@ -27,7 +27,11 @@ MOVING_MPS = 1.0
 
 
 class Metrics(NamedTuple):
-    """Result of one run; `trace_excess_mps` is how far it left the EPA band at worst (0 if held)."""
+    """Result of one run.
+
+    `trace_excess_mps` is how far it left the EPA band at worst (0 if held). `share_travel_per_min` sums up all changes of
+    the share, those too that are too small to count as one.
+    """
 
     delta_soc_percent: float
     wh_per_km: float
@@ -42,6 +46,7 @@ class Metrics(NamedTuple):
     locked_s: float
     longest_locked_s: float
     share_changes_per_min: float
+    share_travel_per_min: float
     rms_jerk_mps3: float
     max_torque_rate_nmps: float
     final_soc: float
@@ -101,6 +106,7 @@ def measure(run: Run, vehicle: VehicleParams) -> Metrics:
         locked_s=float(np.count_nonzero(locked) * dt),
         longest_locked_s=longest_s(locked, dt),
         share_changes_per_min=share_changes(run["decided_share"]) / minutes if minutes > 0.0 else 0.0,
+        share_travel_per_min=float(np.abs(np.diff(run["decided_share"])).sum()) / minutes if minutes > 0.0 else 0.0,
         rms_jerk_mps3=float(np.sqrt(np.mean(jerk**2))) if jerk.size else 0.0,
         max_torque_rate_nmps=float(np.max(np.abs(np.diff(torques, axis=1))) / dt) if torques.shape[1] > 1 else 0.0,
         final_soc=run.final.soc,

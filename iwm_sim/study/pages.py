@@ -262,6 +262,8 @@ def _rivals(content: Content) -> Iterator[TableOf]:
         Column("part", "ours of possible", "", 2),
         Column("changes", "changes ours", "1/min", 1),
         *(Column(f"changes {label}", f"changes {label}", "1/min", 1) for label in labels if "slip" in label),
+        Column("moved", "moved ours", "1/min", 1),
+        Column("moved blind", f"moved {criteria.INSTANTANEOUS}", "1/min", 1),
         Column("trace", "trace"),
     ]
     for idle_drive, meaning in _IDLE_DRIVES.items():
@@ -278,6 +280,8 @@ def _rivals(content: Content) -> Iterator[TableOf]:
                     "part": ours["share_of_possible"],
                     "changes": ours["share_changes_per_min"],
                     **{f"changes {label}": by[label]["share_changes_per_min"] for label in labels if "slip" in label},
+                    "moved": ours["share_travel_per_min"],
+                    "moved blind": by[criteria.INSTANTANEOUS]["share_travel_per_min"],
                     "trace": _traces(iter(by.values())),
                 }
             )
@@ -289,7 +293,7 @@ def _rivals(content: Content) -> Iterator[TableOf]:
             rows,
             "Saving of battery energy against equal split on the same road; no number where the distances differ by "
             "more than 0.1 %. Preview knows the whole cycle; its changes of the share have the price they have in our "
-            "policy, or none.",
+            "policy, or none. Changes are those by more than 0.25; moved is the sum of all, 1 being all the power.",
         )
 
 

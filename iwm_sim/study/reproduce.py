@@ -72,7 +72,7 @@ _KEPT = (
     *("cycle", "friction", "idle_drive", "label", "strategy", "delta_soc_percent", "wh_per_km", "distance_m"),
     *("saving_percent", "share_of_possible", "same_distance_as_equal", "rms_speed_error_mps", "max_speed_error_mps"),
     *("trace_held", "trace_excess_mps", "min_slip", "max_slip", "locked_s", "longest_locked_s"),
-    *("share_changes_per_min", "rms_jerk_mps3", "max_torque_rate_nmps"),
+    *("share_changes_per_min", "share_travel_per_min", "rms_jerk_mps3", "max_torque_rate_nmps"),
 )
 
 

@@ -118,6 +118,7 @@ def test_drivability():
         CAR,
     )
     assert found.share_changes_per_min == pytest.approx(2 / (0.6 / 60))
+    assert found.share_travel_per_min == pytest.approx(1.5 / (0.6 / 60))
     assert found.rms_jerk_mps3 == pytest.approx(1.0)
     assert found.max_torque_rate_nmps == pytest.approx(200.0)
 
