@@ -29,8 +29,8 @@ MOVING_MPS = 1.0
 class Metrics(NamedTuple):
     """Result of one run.
 
-    `trace_excess_mps` is how far it left the EPA band at worst (0 if held). `share_travel_per_min` sums up all changes of
-    the share, those too that are too small to count as one.
+    `trace_excess_mps` is how far it left the EPA band at worst (0 if held). `share_travel_per_min` sums up all changes
+    of the share, those too that are too small to count as one.
     """
 
     delta_soc_percent: float
