@@ -30,7 +30,11 @@ except BaseException as error:
 """
 
 
-def start(name: str, library: str, folder: Path, setup: str = "pass") -> subprocess.Popen[str]:
+#: A test run in a shell's background ignores SIGINT, and so would what it starts.
+HEED_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+
+
+def start(name: str, library: str, folder: Path, setup: str = HEED_CTRL_C) -> subprocess.Popen[str]:
     """Start an executable as its launcher does, with a library that is still being imported."""
     (folder / f"{library}.py").write_text(SLOW)
     package = "iwm_power_manager" if hasattr(executables, name) else "iwm_sim"

@@ -95,7 +95,7 @@ class DemandCounter:
         A demand that is half a step late, or a time that goes back, begins a new sequence.
         """
         late_ns = stamp_ns - self._due_ns
-        if self._bin >= 0 and -self._dt_ns < late_ns < -self._dt_ns // 20:
+        if self._bin >= 0 and -self._dt_ns < late_ns < -self._dt_ns // 40:
             return
         last = self._bin
         self._bin = bisect_left(self._power_edges, power_w)

@@ -10,8 +10,12 @@ import pytest
 
 from iwm_power_manager.bags.demand_counts import DemandTransitions, load_transitions, save_transitions
 from iwm_power_manager.mdp.demand import count_steps
+from iwm_power_manager.mdp.problem import load_problem
+from iwm_power_manager.share import share_path
 
 PERIOD_NS = 10_000_000
+#: Sets of inputs in a decision step of the policies.
+SETS = round(load_problem(share_path("config/grids/coupled.yaml")).dt_s * 1e9 / PERIOD_NS)
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +33,8 @@ def demands(count: int) -> np.ndarray:
 
 
 def drive(bench, demand_w: np.ndarray, first_ns: int) -> None:
-    """Ten sets of inputs for each demand, each set answered before the next is sent."""
-    for k, power in enumerate(np.repeat(demand_w, 10)):
+    """The sets of inputs of a decision step for each demand, each set answered before the next is sent."""
+    for k, power in enumerate(np.repeat(demand_w, SETS)):
         bench.answer_to(bench.send(demand=float(power), stamp_ns=first_ns + k * PERIOD_NS))
 
 
