@@ -119,7 +119,9 @@ def test_the_solver_gets_the_same_chain_as_from_the_drive_itself(tmp_path: Path)
     source = transitions_source(tmp_path / "log.npz", problem.dt_s, 3.0)
     assert (source.name, source.steps, source.weight) == ("log.npz", 2999, 3.0)
     learned = chain_of(problem, [source])
-    wanted = chain_of(problem, [signal_source("drive", np.arange(3000) * problem.dt_s, power, problem.dt_s, 3.0, speed)])
+    wanted = chain_of(
+        problem, [signal_source("drive", np.arange(3000) * problem.dt_s, power, problem.dt_s, 3.0, speed)]
+    )
     assert learned.row_steps == pytest.approx(wanted.row_steps)
     assert learned.probability == pytest.approx(wanted.probability)
     assert learned.by_speed == pytest.approx(wanted.by_speed)
