@@ -214,6 +214,22 @@ def test_a_change_that_was_just_made_is_dear_to_take_back_and_cheap_to_go_on_wit
     assert moves(price, -tendency) == free  # further the same way costs no more than ever
 
 
+def test_the_latest_changes_weigh_as_much_as_the_settings_say():
+    table = TABLE._replace(expected_cost_j=TABLE.expected_cost_j * 0.0, discount=0.0, switching_fixed_cost_j=0.0)
+    chosen = []
+    for price in np.geomspace(0.1, 1e3, 30):
+        for recent, weight in ((-0.4, 16.0), (0.4, 16.0), (0.4, 0.5), (0.0, 16.0)):
+            s = default_settings("sdp_lookahead")._replace(reversal_price=weight)
+            priced = table._replace(switching_cost_j=price)
+            ours = decide(3000.0, 12.0, 0.0, 0.0, 0.6, recent, 0.9, 0, s, CAR, priced)
+            assert ours == lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.6, weight * recent, CAR, priced)
+            chosen.append((recent, weight, price, ours))
+    moved = {}
+    for recent, weight, _, ours in chosen:
+        moved[recent, weight] = moved.get((recent, weight), 0) + (ours != 0.6)
+    assert len(set(moved.values())) == 3, "held back a lot, a little, or not at all"
+
+
 def choose(strategy, power=1500.0, decisions=0, previous=0.3, speed=12.0, friction=0.9, recent=0.0):
     s = default_settings(strategy)
     return decide(power, speed, 0.01, -0.02, previous, recent, friction, decisions, s, CAR, TABLE)
