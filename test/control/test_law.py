@@ -481,7 +481,8 @@ def test_a_gate_cuts_at_once_and_the_way_back_is_slew_limited():
 
 
 @pytest.mark.parametrize(
-    ("dt", "period", "taken"), [(0.01, 0.02, [0, 2, 4, 6, 8]), (0.01, 0.05, [0, 5]), (0.1, 0.02, range(10))]
+    ("dt", "period", "taken"),
+    [(0.01, 0.02, [0, 2, 4, 6, 8]), (0.01, 0.05, [0, 5]), (0.1, 0.02, range(10)), (0.03, 0.107, [0, 4, 8])],
 )
 def test_the_split_is_decided_once_a_period(dt, period, taken):
     s, state, steps = DEFAULT._replace(strategy=t.PREVIEW, decision_period_s=period), initial_state(), []
