@@ -72,6 +72,15 @@ def test_where_ctrl_c_is_ignored_the_imports_ignore_it_too(tmp_path) -> None:
     process.communicate(timeout=60)
 
 
+@pytest.fixture
+def heeding_ctrl_c():
+    """SIGINT as Python has it by default, also where the tests run in a shell's background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heeding_ctrl_c")
 def test_ctrl_c_that_main_does_not_deal_with_gives_the_exit_code(monkeypatch) -> None:
     def main() -> int:
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
