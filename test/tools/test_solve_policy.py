@@ -11,7 +11,8 @@ import pytest
 
 from iwm_power_manager.bags.signals import RecordedDrive
 from iwm_power_manager.cycle import load_cycle
-from iwm_power_manager.mdp.demand import cycle_power_w
+from iwm_power_manager.mdp.demand import chain_of, cycle_power_w, cycle_source, driven_source
+from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import load_policy, load_policy_bank, policy_bytes
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools import solve_policy
@@ -68,6 +69,41 @@ def test_it_writes_one_verified_policy_for_each_road(grid, tmp_path, capsys):
     numbers = json.loads(report.read_text())
     assert [p["checksum"] for p in numbers["policies"]] == [bank[1].checksum, bank[0].checksum]
     assert np.sum(numbers["demand"]["row_steps"]) == 5979.0
+
+
+def test_the_price_of_a_change_is_that_of_the_road_and_is_paid(tmp_path):
+    path = tmp_path / "by_road.yaml"
+    path.write_text(GRID.replace("switching_cost_j: 20", "switching_cost_by_friction: [[0.2, 60], [0.6, 20]]"))
+    assert _solve(path, "--friction", 0.2, 0.5, "--output", tmp_path / "out", "--quiet") == 0
+    for policy, price in zip(load_policy_bank(tmp_path / "out"), (60, 30), strict=True):
+        assert policy.problem.switching_cost_j == pytest.approx(price)
+        path.write_text(GRID.replace("switching_cost_j: 20", f"switching_cost_j: {price}"))
+        assert _solve(path, "--friction", policy.friction, "--output", tmp_path / "same.npz", "--quiet") == 0
+        np.testing.assert_allclose(policy.cost_j, load_policy(tmp_path / "same.npz").cost_j, rtol=0.0, atol=0.05)
+
+
+def test_a_cycle_s_demand_is_a_driver_s_where_the_grid_says_so(grid, tmp_path):
+    driven = tmp_path / "driven.yaml"
+    driven.write_text(GRID + "cycle_demand: driven\n")
+    chains = {}
+    for name, path in (("exact", grid), ("driven", driven)):
+        assert _solve(path, "--friction", 0.5, "--output", tmp_path / f"{name}.npz", "--quiet") == 0
+        chains[name] = load_policy(tmp_path / f"{name}.npz").chain.probability
+    problem = load_problem(driven)
+    vehicle = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+    cycle = load_cycle(share_path("config/cycles/nycc.csv"))
+    for name, source in (("exact", cycle_source), ("driven", driven_source)):
+        wanted = chain_of(problem, [source(cycle, problem.dt_s, vehicle)]).probability
+        np.testing.assert_array_equal(chains[name], wanted)
+    assert not np.array_equal(chains["exact"], chains["driven"])
+
+
+def test_the_shipped_policies_are_of_the_shipped_grid():
+    coupled = load_problem(share_path("config/grids/coupled.yaml"))
+    policies = [load_policy(path) for path in sorted(share_path("policies").glob("*.npz"))]
+    assert len(policies) == 6
+    for policy in policies:
+        assert policy.problem.settings() == coupled.on_road(policy.friction).settings()
 
 
 def test_the_same_inputs_give_the_same_bytes(grid, tmp_path):
