@@ -5,8 +5,7 @@
 transfer and settled slips, for the same road force, and changes only if that saves enough. `sdp` looks the share up in
 the solved policy. `sdp_lookahead` takes the solved cost-to-go instead and minimises, at the continuous state, the cost
 of the next step plus the expected cost of all that follows: no rounding to grid points; what it changed just now it is
-slow to take back. `preview` plays a schedule made
-with the whole cycle known.
+slow to take back. `preview` plays a schedule made with the whole cycle known.
 """
 
 from __future__ import annotations

@@ -168,7 +168,7 @@ def default_settings(strategy: str = "equal") -> Settings:
         slew_regeneration_nmps=4000.0,  # to full regeneration in 0.02 s
         switching_power_w=100.0,
         # The demand's Markov chain does not know how long a demand has lasted, so that the policy takes a passing one
-        # for one that stays. Half of the power, sent back at once, is nine times as dear: five changes a minute less.
+        # for one that stays. Half of the power, sent back at once, is nine times as dear.
         reversal_price=16.0,
         reversal_s=0.5,
     )
