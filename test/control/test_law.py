@@ -19,7 +19,7 @@ from iwm_power_manager.control.types import (
     default_settings,
     initial_state,
 )
-from iwm_power_manager.policy import empty_table
+from iwm_power_manager.policy import empty_table, load_policy
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from oracles import control_law as oracle
@@ -491,6 +491,22 @@ def test_the_split_is_decided_once_a_period(dt, period, taken):
         if state.decisions > before.decisions:
             steps.append(k)
     assert steps == list(taken)
+
+
+def test_the_law_remembers_what_it_changed_just_now_and_is_slow_to_take_it_back():
+    table = load_policy(share_path("policies/jalalmaab_2015_none_coupled_mu090.npz")).table()
+    s, car, m = DEFAULT._replace(strategy=t.SDP_LOOKAHEAD), CARS["none"], measurement(speed=10.0, demand=1000.0)
+
+    def decided(recent, age_s=0.02):
+        before = initial_state()._replace(steps=1, decision_age_s=age_s, recent_change=recent)
+        return law.step(m, before, s, car, table)[0].decided_share
+
+    free = decided(0.0)
+    assert free in (0.0, 1.0), "one axle alone is best here"
+    back = math.copysign(0.5, 0.5 - free)
+    assert decided(back) == 1.0 - free, "it came from there just now; the other axle alone is nearly as good"
+    assert decided(-back) == free
+    assert decided(back, 30.0) == free, "forgotten"
 
 
 def test_equal_split_at_ease_gives_each_motor_a_quarter():
