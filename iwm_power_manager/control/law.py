@@ -123,9 +123,7 @@ def step(
     # 1. slip
     floor = settings.slip_speed_floor_mps
     time_constant = 0.0 if first else settings.slip_filter_s
-    front_slip = filtered(
-        state.front_slip, axle_slip(left_front, right_front, speed, radius, floor), dt, time_constant
-    )
+    front_slip = filtered(state.front_slip, axle_slip(left_front, right_front, speed, radius, floor), dt, time_constant)
     rear_slip = filtered(state.rear_slip, axle_slip(left_rear, right_rear, speed, radius, floor), dt, time_constant)
 
     # 2. split

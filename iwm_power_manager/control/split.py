@@ -167,9 +167,7 @@ def lookahead_share(
     """
     best = previous_share
     best_cost = (
-        _cost_j(
-            power_demand_w, speed_mps, front_slip, rear_slip, previous_share, previous_share, 0.0, vehicle, policy
-        )
+        _cost_j(power_demand_w, speed_mps, front_slip, rear_slip, previous_share, previous_share, 0.0, vehicle, policy)
         - LEAST_DIFFERENCE_W * policy.problem.dt_s
     )
     for k in range(policy.share.size):
@@ -197,9 +195,7 @@ def _cost_j(
     policy: PolicyTable,
 ) -> float:
     """Right-hand side of eq. 31 for one share, J; `dearer` adds that part to the price of the change."""
-    outcome = step_cost_and_next(
-        power_demand_w, speed_mps, front_slip, rear_slip, share, vehicle, policy.problem
-    )
+    outcome = step_cost_and_next(power_demand_w, speed_mps, front_slip, rear_slip, share, vehicle, policy.problem)
     a, fa = locate(policy.power_w, power_demand_w)
     b, fb = locate(policy.speed_mps, outcome.speed_mps)
     c, fc = locate(policy.slip_front, outcome.slip_front)

@@ -35,9 +35,7 @@ def road_load_n(speed_mps: float, grade: float, chassis: Chassis) -> float:
 
 
 @kernel
-def normal_forces_n(
-    acceleration_mps2: float, speed_mps: float, grade: float, chassis: Chassis
-) -> tuple[float, float]:
+def normal_forces_n(acceleration_mps2: float, speed_mps: float, grade: float, chassis: Chassis) -> tuple[float, float]:
     """Normal force of one front and one rear wheel, N (eq. 7, 8), never negative."""
     cosine = 1.0 / math.sqrt(1.0 + grade * grade)
     sine = grade * cosine

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import signal
 import sys
 import threading
 import time
@@ -38,6 +37,7 @@ from ..bags.recover import recover
 from ..bags.writer import WriterOptions
 from ..errors import BagError, IwmError
 from ..files import content_sha256
+from ..ros.interruption import Interruption
 from ..ros.messages import (
     CLOCK,
     FRICTION_BRAKE_COMMAND,
@@ -155,10 +155,10 @@ class Recorder(Node):
 
     # --- main loop --------------------------------------------------------------------------------------------------
 
-    def run(self, stop: threading.Event) -> None:
-        """Discover and take until `stop` is set or recording has failed."""
+    def run(self, interruption: Interruption) -> None:
+        """Discover and take until asked to end or recording has failed."""
         next_discovery = 0.0
-        while not stop.wait(self._poll_s):
+        while not interruption.wait(self._poll_s):
             now = time.monotonic()
             if now >= next_discovery:
                 self._discover(now)
@@ -390,28 +390,27 @@ def _recover(folders: Sequence[str]) -> int:
 
 
 def _run_node(arguments: list[str]) -> int:
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    interruption = Interruption(started=True)  # a bag that has been created is closed in order
+    interruption.install()
     try:
         # rclpy's own handlers would close DDS before the last messages are taken.
         rclpy.init(args=["recorder", *arguments], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # rcl's only word for a wrong --ros-args
         raise ParameterError(" ".join(str(error).split())) from None
     try:
-        return _record(stop)
+        return _record(interruption)
     finally:
         rclpy.try_shutdown()
 
 
-def _record(stop: threading.Event) -> int:
+def _record(interruption: Interruption) -> int:
     node = Recorder()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     spinning = threading.Thread(target=_spin, args=(executor,), name="executor", daemon=True)
     spinning.start()
     try:
-        node.run(stop)
+        node.run(interruption)
         node.finish()
     finally:
         executor.shutdown()

@@ -8,9 +8,7 @@ in, under the quality of service their publishers had offered.
 from __future__ import annotations
 
 import importlib
-import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -26,6 +24,7 @@ from ..bags.mapping import topic_named
 from ..bags.reader import BagReader, Message
 from ..bags.replay import COMPUTED
 from ..errors import BagError
+from .interruption import Interruption
 from .messages import CLOCK, clock_message
 from .raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET
 
@@ -71,15 +70,14 @@ def play(bag: BagReader, options: PlayOptions) -> int:
     BagError
         Nothing can be played: a topic or a message type is missing.
     """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    interruption = Interruption(started=True)
+    interruption.install()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node("replay", enable_rosout=False, start_parameter_services=False)
     try:
-        player = _Player(node, bag, options, stop)
+        player = _Player(node, bag, options, interruption)
         player.wait_for_listeners()
-        while player.pass_once() and options.loop and not stop.is_set():
+        while player.pass_once() and options.loop and not interruption.requested:
             pass
         player.finish()
     finally:
@@ -89,10 +87,10 @@ def play(bag: BagReader, options: PlayOptions) -> int:
 
 
 class _Player:
-    def __init__(self, node: Node, bag: BagReader, options: PlayOptions, stop: threading.Event) -> None:
+    def __init__(self, node: Node, bag: BagReader, options: PlayOptions, interruption: Interruption) -> None:
         self._bag = bag
         self._options = options
-        self._stop = stop
+        self._interruption = interruption
         self._publishers = {name: _publisher(node, bag, name) for name in _chosen(bag, options.topics)}
         self._clock = node.create_publisher(Clock, CLOCK, QoSProfile(depth=_DEPTH))
         self._sent = 0
@@ -101,19 +99,19 @@ class _Player:
     def wait_for_listeners(self) -> None:
         """Wait for the listeners that were asked for, else until somebody listens and no more listeners appear."""
         wanted = self._options.listeners
-        while wanted and not self._stop.wait(0.02):
+        while wanted and not self._interruption.wait(0.02):
             if all(publisher.get_subscription_count() >= wanted for publisher in self._publishers.values()):
-                self._stop.wait(_SETTLE_S)
+                self._interruption.wait(_SETTLE_S)
                 return
         deadline = time.monotonic() + _PATIENCE_S
         count, since = -1, time.monotonic()
-        while time.monotonic() < deadline and not self._stop.wait(0.02):
+        while time.monotonic() < deadline and not self._interruption.wait(0.02):
             now = sum(publisher.get_subscription_count() for publisher in self._publishers.values())
             if now != count:
                 count, since = now, time.monotonic()
             elif count and time.monotonic() - since > _SETTLE_S:
                 return
-        if not count and not self._stop.is_set():
+        if not count and not self._interruption.requested:
             print("replay: nobody listens; playing all the same", file=sys.stderr)
 
     def pass_once(self) -> bool:
@@ -159,12 +157,12 @@ class _Player:
         """Let time come to `time_ns` and tell it; False if it is to stop."""
         if self._options.step:
             if ticks and not sys.stdin.readline():
-                self._stop.set()
+                self._interruption.requested = True
         else:
             wait_s = started_s + (time_ns - first_ns) / _NS_PER_S / self._options.rate - time.monotonic()
             if wait_s > 0.0:
-                self._stop.wait(wait_s)
-        if self._stop.is_set():
+                self._interruption.wait(wait_s)
+        if self._interruption.requested:
             return False
         self._clock.publish(clock_message(time_ns))
         return True

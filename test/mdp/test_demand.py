@@ -170,10 +170,14 @@ def test_a_problem_says_whose_demand_it_takes_of_a_cycle():
     driven = source_of(cycle, _by_speed(cycle_demand="driven", dt_s=0.5), CAR, 2.0)
     assert exact.sequences[0].tolist() == cycle_power_w(cycle, 0.5, CAR).tolist()
     assert driven.sequences[0].tolist() == driven_source(cycle, 0.5, CAR).sequences[0].tolist()
-    assert (driven.name, driven.sha256, driven.weight) == (exact.name, exact.sha256, exact.weight) == (
-        cycle.name,
-        cycle.sha256,
-        2.0,
+    assert (
+        (driven.name, driven.sha256, driven.weight)
+        == (exact.name, exact.sha256, exact.weight)
+        == (
+            cycle.name,
+            cycle.sha256,
+            2.0,
+        )
     )
 
 

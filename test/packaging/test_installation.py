@@ -13,9 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 EXECUTABLES = sorted(
-    entry.name
-    for entry in metadata.distribution("iwm_power_manager").entry_points
-    if entry.group == "console_scripts"
+    entry.name for entry in metadata.distribution("iwm_power_manager").entry_points if entry.group == "console_scripts"
 )
 
 
