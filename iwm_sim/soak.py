@@ -1,9 +1,8 @@
 """`python -m iwm_sim.soak`: half an hour in real time at 100 Hz; memory, deadlines and counts.
 
-Simulator, power manager and recorder run as in a car. Meanwhile this process samples the memory of each, keeps a
-deadline of its own at the same rate with nothing to do, and asks the kernel how long the power manager was ready to run
-and was not let: where the power manager is late and one of the two says so, it was the machine. At the end the bag has
-to hold exactly what each topic's publisher says it published.
+Simulator, power manager and recorder run as in a car. Meanwhile this process samples the memory of each, and a witness
+notes when the machine stood still or let the power manager wait: a late step that would have been in time without that
+was the machine's. At the end the bag has to hold exactly what each topic's publisher says it published.
 """
 
 from __future__ import annotations
@@ -13,12 +12,9 @@ import itertools
 import json
 import sys
 import tempfile
-import threading
 import time
-from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,6 +30,7 @@ from iwm_sim.demo import environment, node_command
 from iwm_sim.domains import claimed_domain
 from iwm_sim.drive import load_run
 from iwm_sim.processes import Child, Children
+from iwm_sim.witness import Witness
 
 _RATE_HZ = 100.0
 _PERIOD_S = 1.0 / _RATE_HZ
@@ -42,58 +39,7 @@ _SAMPLE_S = 5.0
 _SETTLED = 0.2
 #: A step is late when it comes this many periods after the previous one.
 _LATE_PERIODS = 1.5
-#: The machine's own lateness counts as the cause when it is this near.
-_NEAR_S = 0.1
 _SIMULATED = (m.VEHICLE_SPEED, m.WHEEL_STATES, m.BATTERY_STATE, m.POWER_DEMAND, m.ACCELERATOR_PEDAL, m.BRAKE_PEDAL)
-
-
-class Witness(threading.Thread):
-    """Notes, at the control rate, what the machine did: whether it was late, and how long it let a process wait.
-
-    Parameters
-    ----------
-    pid : process whose main thread is watched
-
-    Attributes
-    ----------
-    late_s : wall-clock times at which this thread, with nothing to do, came too late
-    times_s, waited_s : when the watched thread was looked at, and how long it had been ready to run but not running
-    """
-
-    def __init__(self, pid: int) -> None:
-        super().__init__(daemon=True)
-        self._schedule = Path(f"/proc/{pid}/schedstat")
-        self.late_s: list[float] = []
-        self.times_s: list[float] = []
-        self.waited_s: list[float] = []
-        self.stopped = threading.Event()
-
-    def run(self) -> None:
-        """Sleep to each deadline until stopped."""
-        due = time.monotonic()
-        while not self.stopped.is_set():
-            due += _PERIOD_S
-            time.sleep(max(due - time.monotonic(), 0.0))
-            behind = time.monotonic() - due
-            if behind > (_LATE_PERIODS - 1.0) * _PERIOD_S:
-                self.late_s.append(time.time())
-                due += behind
-            with suppress(OSError, ValueError, IndexError):  # the process has ended, or the kernel does not say
-                waited_ns = int(self._schedule.read_text().split()[1])
-                self.times_s.append(time.time())
-                self.waited_s.append(waited_ns / 1e9)
-
-    def explains(self, before_s: float, after_s: float) -> bool:
-        """Whether the machine was late itself, or let the process wait for most of what a step came too late."""
-        index = bisect_left(self.late_s, before_s - _NEAR_S)
-        if index < len(self.late_s) and self.late_s[index] <= after_s + _NEAR_S:
-            return True
-        if not self.times_s:
-            return False
-        first = max(bisect_left(self.times_s, before_s - _PERIOD_S) - 1, 0)
-        last = min(bisect_left(self.times_s, after_s + _PERIOD_S), len(self.times_s) - 1)
-        waited_s = self.waited_s[last] - self.waited_s[first]
-        return waited_s >= 0.5 * (after_s - before_s - _PERIOD_S)
 
 
 class Recorded(NamedTuple):
@@ -105,7 +51,7 @@ class Recorded(NamedTuple):
     step_ns : stamps of the power manager's steps
     skipped : steps whose state is not in the bag
     uncommanded : steps without one of the two commands
-    degraded : steps in another mode than normal, after the first normal one
+    degraded : steps in another mode than normal, after the first normal one and while there were inputs
     """
 
     counts: dict[str, int]
@@ -120,12 +66,15 @@ def read_bag(path: Path) -> Recorded:
     counts: Counter[str] = Counter()
     commands: dict[str, set[int]] = {m.WHEEL_TORQUE_COMMAND: set(), m.FRICTION_BRAKE_COMMAND: set()}
     step_ns: list[int] = []
-    skipped = degraded = 0
-    previous, normal = -1, False
+    skipped, previous, normal = 0, -1, False
+    degraded_ns: list[int] = []
+    last_input_ns = 0
     with BagReader(path) as bag:
         for message in bag.messages():
             topic = message.topic.lstrip("/")
             counts[topic] += 1
+            if topic in _SIMULATED:
+                last_input_ns = message.log_time_ns
             if topic not in commands and topic != m.POWER_MANAGER_STATE:
                 continue
             content = deserialize_message(message.data, JointState)
@@ -138,18 +87,38 @@ def read_bag(path: Path) -> Recorded:
             skipped += step - previous - 1 if previous >= 0 else 0
             previous = step
             normal = normal or signals["mode"] == 1
-            degraded += normal and signals["mode"] != 1
+            if normal and signals["mode"] != 1:
+                degraded_ns.append(message.log_time_ns)
             step_ns.append(stamp_ns)
     last = step_ns[-1] if step_ns else 0
     expected = set(step_ns)
     uncommanded = sum(len(expected - {s for s in stamps if s <= last}) for stamps in commands.values())
+    degraded = sum(time_ns <= last_input_ns for time_ns in degraded_ns)
     return Recorded(dict(counts), step_ns, skipped, uncommanded, degraded)
 
 
-def late_steps(step_ns: Sequence[int], explains: Callable[[float, float], bool]) -> tuple[int, int]:
-    """Late steps, and how many of them the machine does not explain."""
-    late = [(a / 1e9, b / 1e9) for a, b in itertools.pairwise(step_ns) if b - a > _LATE_PERIODS * _PERIOD_S * 1e9]
-    return len(late), sum(not explains(before_s, after_s) for before_s, after_s in late)
+class LateStep(NamedTuple):
+    """A step that came too late: seconds since the first step, since the previous one, and what the machine took."""
+
+    time_s: float
+    gap_s: float
+    machine_s: float
+
+    @property
+    def own(self) -> bool:
+        """It would have been late without the machine's part, too."""
+        return self.gap_s - self.machine_s > _LATE_PERIODS * _PERIOD_S
+
+
+def late_steps(step_ns: Sequence[int], machine_s: Callable[[float, float], float]) -> list[LateStep]:
+    """Late steps; `machine_s` tells what the machine took between two wall-clock times, s."""
+    return [
+        LateStep(
+            (after_ns - step_ns[0]) / 1e9, (after_ns - before_ns) / 1e9, machine_s(before_ns / 1e9, after_ns / 1e9)
+        )
+        for before_ns, after_ns in itertools.pairwise(step_ns)
+        if after_ns - before_ns > _LATE_PERIODS * _PERIOD_S * 1e9
+    ]
 
 
 def resident_kb(child: Child) -> int:
@@ -212,7 +181,7 @@ def drive(minutes: float, folder: Path) -> tuple[dict[str, list[int]], Witness, 
         simulator.check()
         manager.interrupt()
         recorder.interrupt(60.0)
-        witness.stopped.set()
+        witness.stop()
     notes = load_run(result)[1]
     return memory, witness, read_bag(bag), notes["published"]
 
@@ -236,12 +205,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"memory of the {name:14} {memory[name][-1] / 1024:7.1f} MB, growth {percent:+.1f} %")
         if percent > chosen.growth:
             problems.append(f"the {name} grew by {percent:.1f} %")
-    late, own = late_steps(recorded.step_ns, witness.explains)
+    late = late_steps(recorded.step_ns, witness.machine_s)
+    own = [step for step in late if step.own]
     steps = len(recorded.step_ns)
-    print(f"{steps} steps; {late} late, {own} of them by itself; the machine was late {len(witness.late_s)} times")
-    print(f"{recorded.degraded} steps in another mode than normal")
+    print(f"{steps} steps; {len(late)} late, {len(own)} of them without the machine")
+    for step in own:
+        print(
+            f"  at {step.time_s:.2f} s, {1000 * step.gap_s:.1f} ms after the previous one; "
+            f"the machine took {1000 * step.machine_s:.1f} ms"
+        )
+    print(witness.summary())
+    print(f"{recorded.degraded} steps in another mode than normal while there were inputs")
     if own:
-        problems.append(f"{own} late steps that the machine does not explain")
+        problems.append(f"{len(own)} late steps that the machine does not explain")
     for topic in _SIMULATED:
         count = recorded.counts.get(topic, 0)
         print(f"{topic:22} published {published.get(topic, 0):7}, recorded {count:7}")
@@ -255,7 +231,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     print("; ".join(problems) or "nothing grew, nothing was lost, nothing was late by itself")
     if chosen.json:
-        numbers = {"growth_percent": growth, "steps": steps, "late": late, "late_by_itself": own, "problems": problems}
+        numbers = {
+            "growth_percent": growth,
+            "steps": steps,
+            "late": len(late),
+            "late_by_itself": len(own),
+            "problems": problems,
+        }
         files.atomic_write(chosen.json, json.dumps(numbers, indent=1).encode())
     return 1 if problems else 0
 

@@ -115,18 +115,15 @@ class TestSoak:
         assert soak.growth_percent([50, 80, *([100] * 8), *([110] * 2)]) == pytest.approx(10.0)
         assert soak.growth_percent([100] * 20 + [0]) == 0.0
 
-    def test_a_late_step_is_the_machines_when_that_was_late_too(self) -> None:
-        stamps = [ms * 1_000_000 for ms in range(0, 2000, 10) if ms not in (30, 1500)]
-        witness = soak.Witness(0)
-        assert soak.late_steps(stamps, witness.explains) == (2, 2)
-        for late, own in (([0.9], 2), ([0.03], 1), ([0.03, 1.45], 0)):
-            witness.late_s = late
-            assert soak.late_steps(stamps, witness.explains) == (2, own)
+    def test_a_late_step_is_the_machines_when_it_had_been_in_time_without(self) -> None:
+        stamps = [ms * 1_000_000 for ms in range(5000, 7000, 10) if ms not in (5030, 6500)]
+        asked = []
 
-    def test_a_late_step_is_the_machines_when_it_let_the_process_wait(self) -> None:
-        stamps = [ms * 1_000_000 for ms in range(0, 2000, 10) if ms not in (30, 1500)]
-        witness = soak.Witness(0)
-        witness.times_s = [ms / 1000 for ms in range(0, 2000, 10)]
-        # Kept waiting for 8 ms around 1.5 s, and for 1 ms around 0.03 s: the first step was late by itself.
-        witness.waited_s = [(0.001 if t > 0.03 else 0.0) + (0.008 if t > 1.495 else 0.0) for t in witness.times_s]
-        assert soak.late_steps(stamps, witness.explains) == (2, 1)
+        def machine_s(begin_s: float, end_s: float) -> float:
+            asked.append((begin_s, end_s))
+            return 0.006 if begin_s < 6.0 else 0.004
+
+        first, second = soak.late_steps(stamps, machine_s)
+        assert asked == [(5.02, 5.04), (6.49, 6.51)]
+        assert first == pytest.approx((0.04, 0.02, 0.006)) and not first.own
+        assert second == pytest.approx((1.51, 0.02, 0.004)) and second.own
