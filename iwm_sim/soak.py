@@ -132,7 +132,7 @@ def resident_kb(child: Child) -> int:
 
 def growth_percent(samples_kb: Sequence[int]) -> float:
     """Growth from the median of the first settled fifth to that of the last, %."""
-    settled = [sample for sample in samples_kb[int(len(samples_kb) * _SETTLED) :] if sample]
+    settled = samples_kb[int(len(samples_kb) * _SETTLED) :]
     fifth = max(len(settled) // 5, 1)
     first, last = np.median(settled[:fifth]), np.median(settled[-fifth:])
     return float(100.0 * (last / first - 1.0))
@@ -186,7 +186,8 @@ def drive(
         watched = {"recorder": recorder, "power manager": manager, "simulator": simulator}
         while simulator.running:
             for name, child in watched.items():
-                memory.setdefault(name, []).append(resident_kb(child))
+                if resident := resident_kb(child):
+                    memory.setdefault(name, []).append(resident)
             for child in (recorder, manager):
                 child.check_running()
             time.sleep(_SAMPLE_S)

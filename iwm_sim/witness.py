@@ -18,8 +18,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from iwm_power_manager.ros import realtime
-
 _TICK_S = 0.001
 #: Above every other thread that asks for real time here; normal priority where that is refused.
 _PRIORITY = 60
@@ -93,7 +91,10 @@ class Witness:
         )
 
     def _watch(self, processor: int, looks_at_process: bool) -> None:
-        if realtime.request(_PRIORITY, {processor}, lock_memory=False):
+        os.sched_setaffinity(0, {processor})  # of this thread
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+        except OSError:
             self.real_time = False
         due = time.monotonic()
         while not self._stopped.is_set():

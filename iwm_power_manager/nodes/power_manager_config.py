@@ -204,7 +204,14 @@ SPECS = (
         1.0,
         86400.0,
     ),
-    Spec("realtime_priority", 0, "SCHED_FIFO priority; 0 keeps the normal scheduler.", 0, 99, change=Change.NEVER),
+    Spec(
+        "realtime_priority",
+        0,
+        "SCHED_FIFO priority of the control thread, and one less for those of DDS; 0 keeps the normal scheduler.",
+        0,
+        99,
+        change=Change.NEVER,
+    ),
     Spec(
         "cpu_affinity", "", "Processors the node may run on, such as '1' or '0,2'; empty is all.", change=Change.NEVER
     ),

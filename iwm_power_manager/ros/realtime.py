@@ -9,6 +9,8 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import threading
+from collections.abc import Callable
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 
@@ -53,25 +55,40 @@ def resume_automatic_collection() -> None:
 
 
 def request(priority: int, processors: set[int], lock_memory: bool) -> list[str]:
-    """Ask for a SCHED_FIFO priority of the calling thread (0: not), processors (empty: all) and locked memory.
+    """Ask for a SCHED_FIFO priority (0: not), processors (empty: all) and locked memory for this process.
+
+    The calling thread gets the priority, all others, which are those of DDS, one less: they do not delay it, but what
+    it waits for, a lock that one of them holds, does not wait behind the whole rest of the system either.
 
     Returns
     -------
     what was refused, in words; empty if nothing was
     """
     refused = []
-    if processors:
-        try:
-            os.sched_setaffinity(0, processors)
-        except OSError as error:
-            refused.append(f"CPU affinity {sorted(processors)}: {error.strerror}")
+    if processors and (problem := _for_every_thread(lambda thread: os.sched_setaffinity(thread, processors))):
+        refused.append(f"CPU affinity {sorted(processors)}: {problem}")
     if priority:
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        except OSError as error:
-            refused.append(f"SCHED_FIFO priority {priority}: {error.strerror}")
+        caller, other = os.sched_param(priority), os.sched_param(max(priority - 1, 1))
+
+        def schedule(thread: int) -> None:
+            os.sched_setscheduler(thread, os.SCHED_FIFO, caller if thread == threading.get_native_id() else other)
+
+        if problem := _for_every_thread(schedule):
+            refused.append(f"SCHED_FIFO priority {priority}: {problem}")
     if lock_memory:
         libc = ctypes.CDLL(None, use_errno=True)
         if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
             refused.append(f"locked memory: {os.strerror(ctypes.get_errno())}")
     return refused
+
+
+def _for_every_thread(ask: Callable[[int], None]) -> str:
+    """Ask something for every thread of this process; the first refusal in words, "" if there was none."""
+    for name in os.listdir("/proc/self/task"):
+        try:
+            ask(int(name))
+        except ProcessLookupError:
+            pass  # it has just ended
+        except OSError as error:
+            return str(error.strerror)
+    return ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import threading
 
 import pytest
 
@@ -52,6 +53,52 @@ def test_an_affinity_that_exists_is_granted() -> None:
         assert os.sched_getaffinity(0) == {min(before)}
     finally:
         os.sched_setaffinity(0, before)
+
+
+def test_every_thread_gets_it_and_the_others_a_priority_less(monkeypatch) -> None:
+    asked: dict[int, int] = {}
+    monkeypatch.setattr(os, "sched_setscheduler", lambda thread, _, param: asked.update({thread: param.sched_priority}))
+    placed: dict[int, set[int]] = {}
+    monkeypatch.setattr(os, "sched_setaffinity", lambda thread, processors: placed.update({thread: processors}))
+    end = threading.Event()
+    other = threading.Thread(target=end.wait)
+    other.start()
+    try:
+        assert realtime.request(7, {0}, lock_memory=False) == []
+    finally:
+        end.set()
+        other.join()
+    assert asked[threading.get_native_id()] == 7
+    assert asked[other.native_id] == 6
+    assert placed[threading.get_native_id()] == placed[other.native_id] == {0}
+
+
+def test_the_lowest_priority_is_that_of_all_threads(monkeypatch) -> None:
+    asked = set()
+    monkeypatch.setattr(os, "sched_setscheduler", lambda _thread, _, param: asked.add(param.sched_priority))
+    end = threading.Event()
+    other = threading.Thread(target=end.wait)
+    other.start()
+    realtime.request(1, set(), lock_memory=False)
+    end.set()
+    other.join()
+    assert asked == {1}
+
+
+def test_a_thread_that_has_just_ended_is_no_refusal(monkeypatch) -> None:
+    def ended(*_) -> None:
+        raise ProcessLookupError
+
+    monkeypatch.setattr(os, "sched_setscheduler", ended)
+    assert realtime.request(7, set(), lock_memory=False) == []
+
+
+def test_a_refused_priority_is_told_in_words(monkeypatch) -> None:
+    def refuse(*_) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    assert realtime.request(7, set(), lock_memory=False) == ["SCHED_FIFO priority 7: Operation not permitted"]
 
 
 def test_what_the_system_refuses_is_told_in_words() -> None:

@@ -113,7 +113,7 @@ class TestCampaign:
 class TestSoak:
     def test_growth_is_told_between_the_settled_ends(self) -> None:
         assert soak.growth_percent([50, 80, *([100] * 8), *([110] * 2)]) == pytest.approx(10.0)
-        assert soak.growth_percent([100] * 20 + [0]) == 0.0
+        assert soak.growth_percent([100] * 20) == 0.0
 
     def test_a_late_step_is_the_machines_when_it_had_been_in_time_without(self) -> None:
         stamps = [ms * 1_000_000 for ms in range(5000, 7000, 10) if ms not in (5030, 6500)]
