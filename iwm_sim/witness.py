@@ -104,7 +104,8 @@ class Witness:
             if behind > _TICK_S:
                 now = time.time()
                 self.stalls[processor].append(Stall(now - behind, now))
-                due += behind
+                # Stays on the grid: of a stall that follows at once, as little as possible is slept through.
+                due += behind - behind % _TICK_S
             if looks_at_process:
                 with suppress(OSError, ValueError, IndexError):  # the process has ended, or the kernel does not say
                     waited_ns = int(self._schedule.read_text().split()[1])
