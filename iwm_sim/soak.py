@@ -10,11 +10,13 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import os
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -138,12 +140,24 @@ def growth_percent(samples_kb: Sequence[int]) -> float:
     return float(100.0 * (last / first - 1.0))
 
 
+@contextmanager
+def kept_off(processor: int | None) -> Iterator[None]:
+    """The calling thread, and the processes it starts, leave a processor to others, unless it is the only one."""
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, allowed - {processor} or allowed)
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
 def drive(
-    minutes: float, priority: int, folder: Path
+    minutes: float, priority: int, processor: int | None, folder: Path
 ) -> tuple[dict[str, list[int]], Witness, Recorded, Mapping[str, int]]:
     """Drive for some minutes; memory samples by process, the witness, the bag, and what the simulator published.
 
-    With a real-time priority the power manager runs as docs/safety.md asks of a car: its memory is locked, too.
+    With a real-time priority the power manager runs as docs/safety.md asks of a car: its memory is locked, too. On the
+    processor it is given, if any, nothing else of the soak runs but the witness, which then watches that one only.
     """
     cycle = folder / "soak.csv"
     # Up and down between 5 and 15 m/s: drive and brake all the time.
@@ -151,7 +165,7 @@ def drive(
     rows = [f"{30.0 * i:.1f},{5.0 if i % 2 else 15.0}" for i in range(1, 2 * turns)]
     files.atomic_write(cycle, ("time_s,speed_mps\n0.0,0.0\n" + "\n".join(rows) + "\n").encode())
     memory: dict[str, list[int]] = {}
-    with claimed_domain() as domain, Children(environment(folder, domain), folder) as children:
+    with kept_off(processor), claimed_domain() as domain, Children(environment(folder, domain), folder) as children:
         bag, result = folder / "bag", folder / "drive.npz"
         recorder = children.start("recorder", node_command("recorder", {"output": str(bag)}))
         manager = children.start(
@@ -164,6 +178,7 @@ def drive(
                     "input_period_s.battery_state": _PERIOD_S,
                     "realtime_priority": priority,
                     "lock_memory": priority > 0,
+                    "cpu_affinity": "" if processor is None else str(processor),
                 },
             ),
         )
@@ -181,20 +196,18 @@ def drive(
                 },
             ),
         )
-        witness = Witness(manager.process.pid)
-        witness.start()
         watched = {"recorder": recorder, "power manager": manager, "simulator": simulator}
-        while simulator.running:
-            for name, child in watched.items():
-                if resident := resident_kb(child):
-                    memory.setdefault(name, []).append(resident)
-            for child in (recorder, manager):
-                child.check_running()
-            time.sleep(_SAMPLE_S)
-        simulator.check()
-        manager.interrupt()
-        recorder.interrupt(60.0)
-        witness.stop()
+        with Witness(manager.process.pid, None if processor is None else {processor}) as witness:
+            while simulator.running:
+                for name, child in watched.items():
+                    if resident := resident_kb(child):
+                        memory.setdefault(name, []).append(resident)
+                for child in (recorder, manager):
+                    child.check_running()
+                time.sleep(_SAMPLE_S)
+            simulator.check()
+            manager.interrupt()
+            recorder.interrupt(60.0)
     notes = load_run(result)[1]
     return memory, witness, read_bag(bag), notes["published"]
 
@@ -209,12 +222,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=50,
         help="real-time priority (SCHED_FIFO) of the power manager, whose memory is locked then; 0: neither (50)",
     )
+    processors = sorted(os.sched_getaffinity(0))
+    parser.add_argument(
+        "--processor",
+        type=int,
+        choices=[*processors, -1],
+        default=processors[-1],
+        help=f"processor the power manager has for itself; -1: none ({processors[-1]})",
+    )
     parser.add_argument("--growth", type=float, default=5.0, help="growth of memory that passes, %% (5)")
     parser.add_argument("--json", type=Path, help="write the numbers there too")
     chosen = parser.parse_args(arguments)
+    processor = None if chosen.processor < 0 else chosen.processor
     try:
         with tempfile.TemporaryDirectory(prefix="iwm-soak-") as folder:
-            memory, witness, recorded, published = drive(chosen.minutes, chosen.priority, Path(folder))
+            memory, witness, recorded, published = drive(chosen.minutes, chosen.priority, processor, Path(folder))
     except IwmError as error:
         print(f"soak: {error}", file=sys.stderr)
         return 1

@@ -2,25 +2,38 @@
 
 A deadline can be missed because the program took too long, or because it was not run: the operating system gave the
 processor to somebody else, or, on a virtual machine, the host took the processor away. The witness tells the second
-kind. On each processor a thread sleeps from millisecond to millisecond, at real-time priority where that is allowed:
-when it wakes too late, nothing else can have run on that processor either. And the kernel says how long the watched
-process was ready to run and was not let.
+kind, in two ways. As long as the watched process wants to run, what it was not given is the time on the clock less the
+processor time it used; the kernel's account of that leaves out what a host took away, be it slices of a tenth of a
+millisecond. While the process sleeps, a process of the witness's own on its processor sleeps, too, from half a
+millisecond to the next, at real-time priority where that is allowed: when it wakes too late, nothing of less priority
+can have run or been woken there either.
 """
 
 from __future__ import annotations
 
+import gc
+import itertools
 import os
+import subprocess
+import sys
 import threading
 import time
 from array import array
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
-_TICK_S = 0.001
+_TICK_S = 0.0005
+#: Later than this is no ordinary wake-up: on an idle machine one of a thousand takes so long.
+_LATE_S = 0.00025
+#: How often the kernel is asked about the process.
+_LOOK_S = 0.001
 #: Above every other thread that asks for real time here; normal priority where that is refused.
 _PRIORITY = 60
+_COLUMNS = 4
+_REAL_TIME, _NORMAL = b"real-time\n", b"normal\n"
 
 
 class Stall(NamedTuple):
@@ -30,87 +43,106 @@ class Stall(NamedTuple):
     end_s: float
 
 
+class Look(NamedTuple):
+    """What the kernel said about the watched process's main thread.
+
+    Attributes
+    ----------
+    time_s : when, wall-clock s
+    used_s : processor time used since its start
+    sleeps : how often it has gone to sleep by itself since its start
+    wants_to_run : it ran or waited for the processor; 0 or 1
+    """
+
+    time_s: float
+    used_s: float
+    sleeps: float
+    wants_to_run: float
+
+
 class Witness:
-    """Watches every processor this process may use, and the main thread of another process.
+    """Watches processors, and the main thread of another process.
 
     Parameters
     ----------
     pid : process that is watched
+    processors : those it may use; None: all that this process may use
 
     Attributes
     ----------
-    stalls : by processor, in the order of time
-    times_s, waited_s : when the process was looked at (wall-clock s), and how long it had then been ready to run but
-        not running since its start, s
-    real_time : the witnesses run at real-time priority: what they miss, any other thread on their processor misses
+    processes : that watch: one for each processor, one for the watched process
+    stalls : by processor, in the order of time; there once the witness has stopped, like all that follows
+    looks : at the watched process, in the order of time
+    real_time : the witnesses ran at real-time priority: what they missed, any other thread on their processor missed
     """
 
-    def __init__(self, pid: int) -> None:
-        self._schedule = Path(f"/proc/{pid}/schedstat")
+    def __init__(self, pid: int, processors: Collection[int] | None = None) -> None:
+        self._pid = pid
+        self._processors = sorted(os.sched_getaffinity(0) if processors is None else processors)
+        self.processes: list[subprocess.Popen[bytes]] = []
         self.stalls: dict[int, list[Stall]] = {}
-        self.times_s = array("d")
-        self.waited_s = array("d")
+        self.looks: list[Look] = []
         self.real_time = True
-        self._stopped = threading.Event()
-        self._threads: list[threading.Thread] = []
 
-    def start(self) -> None:
+    def __enter__(self) -> Self:
         """Begin to watch."""
-        for index, processor in enumerate(sorted(os.sched_getaffinity(0))):
-            self.stalls[processor] = []
-            thread = threading.Thread(target=self._watch, args=(processor, index == 0), daemon=True)
-            thread.start()
-            self._threads.append(thread)
+        for what in (*(("processor", number) for number in self._processors), ("process", self._pid)):
+            command = [sys.executable, "-m", "iwm_sim.witness", *map(str, what)]
+            self.processes.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+        for process in self.processes:
+            assert process.stdout is not None
+            self.real_time &= process.stdout.readline() != _NORMAL
+        return self
 
-    def stop(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """End watching; what was seen stays."""
-        self._stopped.set()
-        for thread in self._threads:
-            thread.join()
+        found = []
+        for process in self.processes:
+            numbers = array("d")
+            numbers.frombytes(process.communicate()[0])
+            found.append(numbers)
+        *by_processor, seen = found
+        self.stalls = {
+            processor: [Stall(*pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
+            for processor, numbers in zip(self._processors, by_processor, strict=True)
+        }
+        columns = (seen[column::_COLUMNS] for column in range(_COLUMNS))
+        self.looks = [Look(*row) for row in zip(*columns, strict=True)]
 
     def machine_s(self, begin_s: float, end_s: float) -> float:
         """Time between two wall-clock times that the machine took, s.
 
-        The longer of what the stalls of one processor took and what the process waited: a process that is to wake
-        during a stall counts as waiting too.
+        From one look to the next, what the process was not given while it wanted to run all the time, else the stalls
+        of its processor. Of a process that moves between processors it is the longer of what each says, the least the
+        machine took: it is on one at a time, and stalls of two would explain too much when added up.
         """
-        stalled_s = max((_overlap_s(stalls, begin_s, end_s) for stalls in self.stalls.values()), default=0.0)
-        if not self.times_s:
-            return stalled_s
-        first = max(bisect_right(self.times_s, begin_s) - 1, 0)
-        last = min(bisect_left(self.times_s, end_s), len(self.times_s) - 1)
-        return max(stalled_s, self.waited_s[last] - self.waited_s[first])
+        return max((self._taken_s(stalls, begin_s, end_s) for stalls in self.stalls.values()), default=0.0)
+
+    def _taken_s(self, stalls: list[Stall], begin_s: float, end_s: float) -> float:
+        total_s, reached_s = 0.0, begin_s
+        first = max(bisect_right(self.looks, begin_s, key=lambda look: look.time_s) - 1, 0)
+        for before, after in itertools.pairwise(self.looks[first:]):
+            if before.time_s >= end_s:
+                break
+            inside_s = min(after.time_s, end_s) - max(before.time_s, begin_s)
+            if inside_s <= 0.0 or not before.wants_to_run or after.sleeps != before.sleeps:
+                continue
+            # A stretch in which it wanted to run all the time; what lies before it goes by the stalls.
+            total_s += _overlap_s(stalls, reached_s, max(before.time_s, begin_s))
+            lasted_s = after.time_s - before.time_s
+            total_s += max(lasted_s - (after.used_s - before.used_s), 0.0) * inside_s / lasted_s
+            reached_s = min(after.time_s, end_s)
+        return total_s + _overlap_s(stalls, reached_s, end_s)
 
     def summary(self) -> str:
         """What the machine did, in words."""
         times = " and ".join(str(len(stalls)) for stalls in self.stalls.values()) or "no"
-        longest_s = max((stall.end_s - stall.begin_s for stalls in self.stalls.values() for stall in stalls), default=0)
+        lasted_s = [stall.end_s - stall.begin_s for stalls in self.stalls.values() for stall in stalls]
         priority = "real-time" if self.real_time else "normal"
         return (
-            f"the processors stood still {times} times, at most {1000 * longest_s:.1f} ms (seen at {priority} priority)"
+            f"the processors stood still {times} times, {sum(lasted_s):.2f} s together, at most "
+            f"{1000 * max(lasted_s, default=0.0):.1f} ms (seen at {priority} priority)"
         )
-
-    def _watch(self, processor: int, looks_at_process: bool) -> None:
-        os.sched_setaffinity(0, {processor})  # of this thread
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
-        except OSError:
-            self.real_time = False
-        due = time.monotonic()
-        while not self._stopped.is_set():
-            due += _TICK_S
-            time.sleep(max(due - time.monotonic(), 0.0))
-            behind = time.monotonic() - due
-            if behind > _TICK_S:
-                now = time.time()
-                self.stalls[processor].append(Stall(now - behind, now))
-                # Stays on the grid: of a stall that follows at once, as little as possible is slept through.
-                due += behind - behind % _TICK_S
-            if looks_at_process:
-                with suppress(OSError, ValueError, IndexError):  # the process has ended, or the kernel does not say
-                    waited_ns = int(self._schedule.read_text().split()[1])
-                    self.times_s.append(time.time())
-                    self.waited_s.append(waited_ns / 1e9)
 
 
 def _overlap_s(stalls: list[Stall], begin_s: float, end_s: float) -> float:
@@ -121,3 +153,64 @@ def _overlap_s(stalls: list[Stall], begin_s: float, end_s: float) -> float:
             break
         total_s += min(stall.end_s, end_s) - max(stall.begin_s, begin_s)
     return total_s
+
+
+def _watch_processor(processor: int, stopped: Callable[[], bool]) -> array[float]:
+    """Begin and end of each stall, one after the other."""
+    found = array("d")
+    due = time.monotonic()
+    while not stopped():
+        due += _TICK_S
+        time.sleep(max(due - time.monotonic(), 0.0))
+        behind = time.monotonic() - due
+        if behind > _LATE_S:
+            now = time.time()
+            found.append(now - behind)
+            found.append(now)
+            # Stays on the grid: of a stall that follows at once, as little as possible is slept through.
+            due += behind - behind % _TICK_S
+    return found
+
+
+def _watch_process(pid: int, stopped: Callable[[], bool]) -> array[float]:
+    """The columns of `Look`, row after row."""
+    found = array("d")
+    status, schedule = Path(f"/proc/{pid}/status"), Path(f"/proc/{pid}/schedstat")
+    while not stopped():
+        time.sleep(_LOOK_S)
+        with suppress(OSError, ValueError, IndexError, KeyError):  # it has ended, or the kernel does not say
+            values = dict(line.split(":", 1) for line in status.read_text().splitlines())
+            used_ns = int(schedule.read_text().split()[0])
+            now = time.time()
+            row = (now, used_ns / 1e9, float(values["voluntary_ctxt_switches"]), float("R" in values["State"]))
+            found.extend(row)
+    return found
+
+
+def _main() -> None:
+    """`python -m iwm_sim.witness processor|process NUMBER`: watch until the input ends, then write what was seen."""
+    kind, number = sys.argv[1], int(sys.argv[2])
+    gc.disable()
+    said = _REAL_TIME
+    if kind == "processor":
+        os.sched_setaffinity(0, {number})
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
+    except OSError:
+        said = _NORMAL
+    ended = threading.Event()
+
+    def await_end() -> None:
+        sys.stdin.buffer.read()
+        ended.set()
+
+    threading.Thread(target=await_end, daemon=True).start()
+    sys.stdout.buffer.write(said)
+    sys.stdout.buffer.flush()
+    found = (_watch_processor if kind == "processor" else _watch_process)(number, ended.is_set)
+    sys.stdout.buffer.write(found.tobytes())
+
+
+if __name__ == "__main__":
+    with suppress(KeyboardInterrupt):  # Ctrl-C is for the process that asked; it sees this one end
+        _main()

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import math
+import os
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from iwm_power_manager.ros import messages as m
 from iwm_sim import fault_relay as relay
 from iwm_sim import faults, soak
+from iwm_sim.demo import node_command
 
 WHEELS = m.wheel_states_message(5, m.WHEEL_NAMES, (1.0, 2.0, 3.0, 4.0), (5.0, 6.0, 7.0, 8.0))
 
@@ -127,3 +131,35 @@ class TestSoak:
         assert asked == [(5.02, 5.04), (6.49, 6.51)]
         assert first == pytest.approx((0.04, 0.02, 0.006)) and not first.own
         assert second == pytest.approx((1.51, 0.02, 0.004)) and second.own
+
+    def test_a_processor_is_left_to_others_unless_it_is_the_only_one(self) -> None:
+        allowed = os.sched_getaffinity(0)
+        one = min(allowed)
+        with soak.kept_off(one):
+            assert os.sched_getaffinity(0) == (allowed - {one} or allowed)
+        with soak.kept_off(None):
+            assert os.sched_getaffinity(0) == allowed
+        assert os.sched_getaffinity(0) == allowed
+
+    def test_six_seconds_of_it(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        asked: dict[str, dict[str, Any]] = {}
+
+        def noted(name: str, parameters: dict[str, Any]) -> list[str]:
+            asked[name] = parameters
+            return node_command(name, parameters)
+
+        monkeypatch.setattr(soak, "node_command", noted)
+        numbers = tmp_path / "soak.json"
+        processor = min(os.sched_getaffinity(0))
+        arguments = f"--minutes 0.1 --priority 7 --processor {processor} --growth 1000 --json".split()
+        code = soak.main([*arguments, str(numbers)])
+        found = json.loads(numbers.read_text())
+        # How busy the machine is while tests run is not for them to say; that nothing was lost is.
+        assert [problem for problem in found["problems"] if "late steps" not in problem] == []
+        assert code == bool(found["problems"])
+        assert found["late_by_itself"] <= found["late"] < found["steps"]
+        assert found["steps"] >= 590
+        assert found["growth_percent"].keys() == {"recorder", "power manager", "simulator"}
+        manager = asked["power_manager"]
+        assert manager["realtime_priority"] == 7 and manager["lock_memory"] is True
+        assert manager["cpu_affinity"] == str(processor)
