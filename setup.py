@@ -19,6 +19,7 @@ NAME = str(MANIFEST.findtext("name"))
 EXECUTABLES = {
     "demo": "iwm_sim.executables:demo",
     "evaluate": "iwm_sim.executables:evaluate",
+    "learn_policy": "iwm_sim.executables:learn_policy",
     "power_manager": "iwm_power_manager.executables:power_manager",
     "recorder": "iwm_power_manager.executables:recorder",
     "replay": "iwm_power_manager.executables:replay",

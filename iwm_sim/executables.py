@@ -15,6 +15,11 @@ def evaluate() -> int:
     return run("iwm_sim.study.evaluate", INTERRUPTED)
 
 
+def learn_policy() -> int:
+    """Command `learn_policy`."""
+    return run("iwm_sim.learn", INTERRUPTED)
+
+
 def simulator() -> int:
     """Node `simulator`."""
     return run("iwm_sim.simulator", NODE_ENDED)

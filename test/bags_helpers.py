@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -139,3 +140,14 @@ def battery(stamp_ns: int, soc: float, temperature_c: float = 25.0) -> bytes:
         header, 230.0, temperature_c, 0.0, math.nan, math.nan, math.nan, soc, 2, 0, 3, True, empty, empty, "", ""
     )
     return bytes(typestore().serialize_cdr(message, BATTERY))
+
+
+def write_drive(path: Path, speed_mps: Iterable[float], demand_w: Iterable[float]) -> None:
+    """A bag with speed and demand every 10 ms, as the recorder writes it."""
+    with BagWriter(path) as writer:
+        speed_topic = writer.add_topic(topic("/vehicle_speed", TWIST))
+        demand_topic = writer.add_topic(topic("/power_demand"))
+        for i, (speed, demand) in enumerate(zip(speed_mps, demand_w, strict=True)):
+            now = (i + 1) * 10_000_000
+            writer.write(speed_topic, now, twist(now, float(speed)), now, i + 1)
+            writer.write(demand_topic, now + 1000, float64(float(demand)), now + 1000, i + 1)

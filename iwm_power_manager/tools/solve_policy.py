@@ -22,7 +22,7 @@ from tqdm import tqdm
 from iwm_power_manager import __version__
 from iwm_power_manager.bags.demand_counts import transitions_source
 from iwm_power_manager.bags.mapping import load_mapping
-from iwm_power_manager.bags.signals import read_signal
+from iwm_power_manager.bags.signals import RecordedDrive, read_signal
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.files import atomic_write, check_number
@@ -163,7 +163,7 @@ def _solve(options: argparse.Namespace) -> int:
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
     problem = _problem(options)
     frictions = [check_number("arguments", "--friction", value, 0.01, 2.0) for value in options.friction]
-    targets = _targets(Path(options.output), vehicle, problem, frictions)
+    paths = targets(Path(options.output), vehicle, problem, frictions)
     say = _silent if options.quiet else print
 
     sources = _sources(options, problem, vehicle)
@@ -174,7 +174,7 @@ def _solve(options: argparse.Namespace) -> int:
         print(f"solve_policy: warning: {warning}", file=sys.stderr)
 
     solved = []
-    for friction, path in zip(frictions, targets, strict=True):
+    for friction, path in zip(frictions, paths, strict=True):
         solved.append(solve_one(problem, vehicle, friction, chain, sources, path, options.quiet))
         say(_convergence_text(solved[-1]))
     if options.plot:
@@ -195,9 +195,14 @@ def _demand_arguments(options: argparse.Namespace) -> None:
     check_number("arguments", "--bag-weight", options.bag_weight, 0.0, 1e6, above=True)
 
 
+def load_grid(name: str) -> Problem:
+    """A grid of the package by its name, or of a file."""
+    preset = resolve(f"config/grids/{name}.yaml")
+    return load_problem(preset if preset.exists() else resolve(name))
+
+
 def _problem(options: argparse.Namespace) -> Problem:
-    preset = resolve(f"config/grids/{options.grid}.yaml")
-    problem = load_problem(preset if preset.exists() else resolve(options.grid))
+    problem = load_grid(options.grid)
     if options.discount is None:
         return problem
     discount = check_number("arguments", "--discount", options.discount, 0.0, 0.9999)
@@ -206,27 +211,33 @@ def _problem(options: argparse.Namespace) -> Problem:
 
 def _sources(options: argparse.Namespace, problem: Problem, vehicle: Vehicle) -> list[Source]:
     sources = [source_of(load_cycle(resolve(path)), problem, vehicle.params) for path in options.cycle]
-    mapping = load_mapping(resolve(options.mapping) if options.mapping else None) if options.bag else None
-    for path in options.bag:
-        drive = read_signal(path, mapping, vehicle.params)
-        for damage in drive.damage:
-            print(f"solve_policy: warning: {path}: {damage}", file=sys.stderr)
-        if drive.bad_messages:
-            print(f"solve_policy: warning: {path}: {drive.bad_messages} bad messages left out", file=sys.stderr)
-        sources.append(
-            signal_source(
-                Path(path).name,
-                drive.time_s,
-                drive.power_demand_w,
-                problem.dt_s,
-                options.bag_weight,
-                drive.speed_mps,
-            )
-        )
+    drives = read_drives(options.bag, options.mapping, vehicle, "solve_policy")
+    sources += [drive_source(name, drive, problem, options.bag_weight) for name, drive in drives]
     return sources + [transitions_source(path, problem.dt_s, options.bag_weight) for path in options.transitions]
 
 
-def _targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequence[float]) -> list[Path]:
+def read_drives(
+    bags: Sequence[str], mapping: str | None, vehicle: Vehicle, command: str
+) -> list[tuple[str, RecordedDrive]]:
+    """Name and content of recorded drives; what is wrong with them goes to stderr in the name of a command."""
+    known = load_mapping(resolve(mapping) if mapping else None) if bags else None
+    drives = []
+    for path in bags:
+        drive = read_signal(path, known, vehicle.params)
+        for damage in drive.damage:
+            print(f"{command}: warning: {path}: {damage}", file=sys.stderr)
+        if drive.bad_messages:
+            print(f"{command}: warning: {path}: {drive.bad_messages} bad messages left out", file=sys.stderr)
+        drives.append((Path(path).name, drive))
+    return drives
+
+
+def drive_source(name: str, drive: RecordedDrive, problem: Problem, weight: float) -> Source:
+    """A recorded drive as a source of demand."""
+    return signal_source(name, drive.time_s, drive.power_demand_w, problem.dt_s, weight, drive.speed_mps)
+
+
+def targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequence[float]) -> list[Path]:
     """Where each policy goes; a folder is made, a file is for one policy only."""
     if len(set(frictions)) != len(frictions):
         raise ConfigError("arguments", "--friction", "names a value twice")

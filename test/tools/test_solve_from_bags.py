@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bags_helpers import TWIST, float64, topic, twist
+from bags_helpers import write_drive
 from iwm_power_manager.bags.demand_counts import DemandCounter, save_transitions
-from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.mdp.problem import load_problem
@@ -47,15 +46,7 @@ def drive():
 def bag(drive, tmp_path_factory):
     """Its speed and demand, as the recorder writes them."""
     path = tmp_path_factory.mktemp("bags") / "nycc_drive"
-    with BagWriter(path) as writer:
-        speed_topic, demand_topic = (
-            writer.add_topic(topic("/vehicle_speed", TWIST)),
-            writer.add_topic(topic("/power_demand")),
-        )
-        for i, (speed, demand) in enumerate(zip(drive["speed_mps"], drive["power_demand_w"], strict=True)):
-            now = (i + 1) * 10_000_000
-            writer.write(speed_topic, now, twist(now, float(speed)), now, i + 1)
-            writer.write(demand_topic, now + 1000, float64(float(demand)), now + 1000, i + 1)
+    write_drive(path, drive["speed_mps"], drive["power_demand_w"])
     return path
 
 

@@ -1,0 +1,182 @@
+"""`learn_policy`: what is recorded is tried at several weights, and only what drives no worse is kept."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bags_helpers import write_drive
+from iwm_power_manager.bags.signals import RecordedDrive
+from iwm_power_manager.control.types import default_settings
+from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.mdp.demand import Source
+from iwm_power_manager.policy import empty_table, load_policy
+from iwm_power_manager.share import share_path
+from iwm_power_manager.tools import solve_policy
+from iwm_power_manager.vehicle import load_vehicle
+from iwm_sim import closed_loop, learn
+from iwm_sim.learn import CYCLES_ALONE, RECORDING_ALONE, Outcome, choose, recorded_cycle, sources_at
+from iwm_sim.metrics import measure
+
+CAR = "jalalmaab_2015"
+
+
+def outcome(weight: float, energy: float, moves: float = 0.0, held: bool = True) -> Outcome:
+    return Outcome(weight, energy, moves, 5.0, held)
+
+
+class TestChoose:
+    def test_the_least_cost_moves_included(self) -> None:
+        best = outcome(2.0, 99.0, 0.5)
+        assert choose([outcome(CYCLES_ALONE, 100.0), outcome(1.0, 98.0, 1.8), best, outcome(3.0, 99.8)]) is best
+
+    def test_the_cycles_where_nothing_is_better(self) -> None:
+        cycles = outcome(CYCLES_ALONE, 100.0)
+        assert choose([outcome(1.0, 100.0), cycles, outcome(2.0, 99.0, 1.5)]) is cycles
+
+    def test_a_lost_trace_is_no_saving(self) -> None:
+        cycles, honest = outcome(CYCLES_ALONE, 100.0), outcome(2.0, 99.9)
+        lost = outcome(1.0, 90.0, held=False)
+        assert choose([cycles, lost, honest]) is honest
+        assert choose([cycles, lost]) is cycles
+
+    def test_a_trace_that_nobody_holds_is_no_reason(self) -> None:
+        better = outcome(1.0, 90.0, held=False)
+        assert choose([outcome(CYCLES_ALONE, 100.0, held=False), better]) is better
+
+
+class TestRecordedCycle:
+    def test_a_point_a_second_with_the_mean_around_it(self) -> None:
+        time_s = np.arange(0.0, 10.001, 0.01)
+        noise = 0.2 * np.cos(2 * math.pi * 5.0 * time_s)
+        drive = RecordedDrive(time_s + 100.0, np.zeros_like(time_s), 2.0 * time_s + noise, 0, ())
+        cycle = recorded_cycle("drive", drive)
+        assert cycle.time_s.tolist() == list(range(11))
+        assert cycle.speed_mps[1:-1] == pytest.approx(2.0 * np.arange(1, 10), abs=0.01)
+        assert cycle.speed_mps[0] == pytest.approx(0.5, abs=0.05)  # of the half second there is
+        assert cycle.name == "drive"
+
+    def test_it_rolls_forwards(self) -> None:
+        time_s = np.linspace(0.0, 5.0, 51)
+        cycle = recorded_cycle("drive", RecordedDrive(time_s, time_s, np.full(51, -0.3), 0, ()))
+        assert cycle.speed_mps.tolist() == [0.0] * 6
+
+    def test_too_short(self) -> None:
+        time_s = np.array([0.0, 1.9])
+        with pytest.raises(ConfigError, match=r"drive.*too short"):
+            recorded_cycle("drive", RecordedDrive(time_s, time_s, time_s, 0, ()))
+
+
+def test_weights_are_those_of_the_recording() -> None:
+    recorded = Source("bag", "", 1.0, (np.zeros(3),))
+    general = Source("cycle", "", 1.0, (np.zeros(3),))
+
+    def weights(weight: float) -> list[tuple[str, float]]:
+        return [(source.name, source.weight) for source in sources_at(weight, [recorded], [general])]
+
+    assert weights(CYCLES_ALONE) == [("cycle", 1.0)]
+    assert weights(RECORDING_ALONE) == [("bag", 1.0)]
+    assert weights(0.2) == [("bag", 0.2), ("cycle", 1.0)]
+
+
+@pytest.fixture(scope="module")
+def nycc_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """NYCC, driven with equal split."""
+    cycle = load_cycle(share_path("config/cycles/nycc.csv"))
+    car = load_vehicle(share_path(f"config/vehicles/{CAR}.yaml"), "drag")
+    drive = closed_loop.run(cycle, car, default_settings("equal"), empty_table(), 0.9)
+    path = tmp_path_factory.mktemp("bags") / "nycc_drive"
+    write_drive(path, drive["speed_mps"], drive["power_demand_w"])
+    return path
+
+
+def cost_of(policy_file: Path, friction: float, idle_drive: str) -> tuple[float, float]:
+    """Energy on the NYCC, and energy with the price of moves, Wh/km."""
+    policy = load_policy(policy_file)
+    cycle = load_cycle(share_path("config/cycles/nycc.csv"))
+    car = load_vehicle(share_path(f"config/vehicles/{CAR}.yaml"), idle_drive)
+    run = closed_loop.run(cycle, car, default_settings("sdp_lookahead"), policy.table(), friction)
+    found = measure(run, car.params)
+    moves_j = policy.problem.switching_cost_j * np.abs(np.diff(run["decided_share"])).sum()
+    return found.wh_per_km, found.wh_per_km + moves_j / 3600.0 / (found.distance_m / 1000.0)
+
+
+def learned_and_general(bag: Path, folder: Path, friction: float, idle_drive: str, weights: list[str]) -> list[Path]:
+    """Policy files: from the bag, and from the three standard cycles."""
+    common = ["--vehicle", CAR, "--idle-drive", idle_drive, "--friction", str(friction), "--quiet"]
+    learned, general = folder / "learned.npz", folder / "general.npz"
+    numbers = ["--json", str(folder / "learn.json")]
+    trial = ["--bag", str(bag), "--drive", "nycc", "--weights", *weights, "--jobs", "2", "--output", str(learned)]
+    assert learn.main([*common, *trial, *numbers]) == learn.DONE
+    cycles = [argument for name in ("ftp75", "hwfet", "nycc") for argument in ("--cycle", name)]
+    assert solve_policy.main([*common, *cycles, "--output", str(general)]) == solve_policy.SOLVED
+    return [learned, general]
+
+
+def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(nycc_bag: Path, tmp_path: Path) -> None:
+    learned, general = learned_and_general(nycc_bag, tmp_path, 0.9, "drag", ["1", "inf"])
+    assert cost_of(learned, 0.9, "drag")[1] < cost_of(general, 0.9, "drag")[1]
+    (road,) = json.loads((tmp_path / "learn.json").read_text())["roads"]
+    assert [row["weight"] for row in road["outcomes"]] == [0.0, 1.0, "inf"]
+    # What it was chosen for is what it does.
+    (chosen,) = (row for row in road["outcomes"] if row["weight"] == road["chosen_weight"])
+    assert (chosen["energy_wh_per_km"], chosen["cost_wh_per_km"]) == pytest.approx(cost_of(learned, 0.9, "drag"))
+    assert chosen["cost_wh_per_km"] == min(row["cost_wh_per_km"] for row in road["outcomes"])
+    assert chosen["energy_wh_per_km"] < road["equal"]["energy_wh_per_km"]
+    policy = load_policy(learned)
+    assert policy.checksum == road["checksum"]
+    assert [source["weight"] for source in policy.sources] == [1.0, 1.0, 1.0, 1.0]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("friction", [0.9, 0.5, 0.2])
+@pytest.mark.parametrize("idle_drive", ["none", "drag"])
+def test_it_is_better_on_every_road(nycc_bag: Path, tmp_path: Path, friction: float, idle_drive: str) -> None:
+    weights = [f"{weight:g}" for weight in learn.WEIGHTS]
+    learned, general = learned_and_general(nycc_bag, tmp_path, friction, idle_drive, weights)
+    energy, cost = cost_of(learned, friction, idle_drive)
+    general_energy, general_cost = cost_of(general, friction, idle_drive)
+    assert cost < general_cost
+    assert energy == pytest.approx(general_energy, rel=1e-4)
+
+
+class TestCommand:
+    def test_the_recorded_speed_is_what_is_driven(self, nycc_bag: Path, tmp_path: Path, capsys) -> None:
+        grid = tmp_path / "coarse.yaml"
+        grid.write_text(
+            "format: 1\npower_w: {from: -12000, to: 20000, step: 2000}\nspeed_mps: {from: 0, to: 30, step: 5}\n"
+            "slip_front: [0]\nslip_rear: [0]\nshare: {from: 0, to: 1, step: 0.25}\nprevious_share: true\n"
+            "slip_model: quasi_steady\ndt_s: 0.2\ndiscount: 0.95\nalpha: 5.0\nswitching_cost_j: 20\n"
+        )
+        arguments = ["--vehicle", CAR, "--bag", str(nycc_bag), "--cycle", "udds", "--grid", str(grid)]
+        arguments += ["--weights", "0.5", "--jobs", "1", "--friction", "0.9", "0.5", "--output", str(tmp_path / "out")]
+        assert learn.main(arguments) == learn.DONE
+        text = capsys.readouterr().out
+        assert "driven: nycc_drive (597 s)" in text or "driven: nycc_drive (598 s)" in text
+        assert text.count("<- chosen") == 2 and text.count("nothing: cycles alone") == 2
+        files = sorted((tmp_path / "out").iterdir())
+        assert [load_policy(file).friction for file in files] == [0.5, 0.9]
+
+    @pytest.mark.parametrize(
+        ("arguments", "said"),
+        [
+            (["--weights", "0"], "--weights"),
+            (["--weights", "nan"], "--weights"),
+            (["--friction", "7"], "--friction"),
+            (["--bag", "no_such_bag"], "no_such_bag"),
+            (["--drive", "no_such_cycle"], "no_such_cycle"),
+        ],
+    )
+    def test_bad_input_is_one_line_and_leaves_nothing(
+        self, nycc_bag: Path, tmp_path: Path, capsys, arguments: list[str], said: str
+    ) -> None:
+        given = ["--vehicle", CAR, "--bag", str(nycc_bag), "--friction", "0.9", "--output", str(tmp_path / "p.npz")]
+        assert learn.main([*given, *arguments]) == learn.BAD_INPUT
+        captured = capsys.readouterr()
+        assert captured.out == "" and captured.err.startswith("learn_policy: error: ") and said in captured.err
+        assert list(tmp_path.iterdir()) == []
