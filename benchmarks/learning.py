@@ -24,6 +24,7 @@ import numpy as np
 
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.demand import chain_of, signal_source, source_of
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import empty_table
@@ -112,7 +113,7 @@ def main() -> int:
             {"idle_drive": idle_drive, "friction": friction, **dict(zip(TAUGHT_BY, by_teacher, strict=True))}
             for (idle_drive, friction), by_teacher in zip(cells, results, strict=True)
         ]
-        Path(options.json).write_text(json.dumps(named, indent=1))
+        atomic_write(options.json, json.dumps(named, indent=1).encode())
     return 0
 
 
