@@ -31,7 +31,7 @@ from iwm_power_manager.ros import messages as m
 from iwm_sim.demo import environment, node_command
 from iwm_sim.domains import claimed_domain
 from iwm_sim.drive import load_run
-from iwm_sim.processes import Child, Children
+from iwm_sim.processes import Child, ChildError, Children
 from iwm_sim.witness import Witness
 
 _RATE_HZ = 100.0
@@ -99,6 +99,25 @@ def read_bag(path: Path) -> Recorded:
     return Recorded(dict(counts), step_ns, skipped, uncommanded, degraded)
 
 
+class Driven(NamedTuple):
+    """What is left of a drive.
+
+    Attributes
+    ----------
+    memory_kb : samples by process
+    witness : of what the machine did
+    recorded : what the bag holds
+    published : messages by topic, as the simulator counted them
+    ends : what was wrong with how power manager and recorder ended
+    """
+
+    memory_kb: dict[str, list[int]]
+    witness: Witness
+    recorded: Recorded
+    published: Mapping[str, int]
+    ends: list[str]
+
+
 class LateStep(NamedTuple):
     """A step that came too late: seconds since the first step, since the previous one, and what the machine took."""
 
@@ -151,10 +170,8 @@ def kept_off(processor: int | None) -> Iterator[None]:
         os.sched_setaffinity(0, allowed)
 
 
-def drive(
-    minutes: float, priority: int, processor: int | None, folder: Path
-) -> tuple[dict[str, list[int]], Witness, Recorded, Mapping[str, int]]:
-    """Drive for some minutes; memory samples by process, the witness, the bag, and what the simulator published.
+def drive(minutes: float, priority: int, processor: int | None, folder: Path) -> Driven:
+    """Drive for some minutes.
 
     With a real-time priority the power manager runs as docs/safety.md asks of a car: its memory is locked, too. On the
     processor it is given, if any, nothing else of the soak runs but the witness, which then watches that one only.
@@ -165,6 +182,7 @@ def drive(
     rows = [f"{30.0 * i:.1f},{5.0 if i % 2 else 15.0}" for i in range(1, 2 * turns)]
     files.atomic_write(cycle, ("time_s,speed_mps\n0.0,0.0\n" + "\n".join(rows) + "\n").encode())
     memory: dict[str, list[int]] = {}
+    ends = []
     with kept_off(processor), claimed_domain() as domain, Children(environment(folder, domain), folder) as children:
         bag, result = folder / "bag", folder / "drive.npz"
         recorder = children.start("recorder", node_command("recorder", {"output": str(bag)}))
@@ -206,10 +224,13 @@ def drive(
                     child.check_running()
                 time.sleep(_SAMPLE_S)
             simulator.check()
-            manager.interrupt()
-            recorder.interrupt(60.0)
+            for child in (manager, recorder):
+                try:
+                    child.interrupt(60.0)
+                except ChildError as error:  # half an hour is not thrown away for that
+                    ends.append(str(error))
     notes = load_run(result)[1]
-    return memory, witness, read_bag(bag), notes["published"]
+    return Driven(memory, witness, read_bag(bag), notes["published"], ends)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -236,11 +257,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     processor = None if chosen.processor < 0 else chosen.processor
     try:
         with tempfile.TemporaryDirectory(prefix="iwm-soak-") as folder:
-            memory, witness, recorded, published = drive(chosen.minutes, chosen.priority, processor, Path(folder))
+            driven = drive(chosen.minutes, chosen.priority, processor, Path(folder))
     except IwmError as error:
         print(f"soak: {error}", file=sys.stderr)
         return 1
-    problems = []
+    memory, witness, recorded, published, ends = driven
+    problems = [*ends]
     growth = {name: growth_percent(samples) for name, samples in memory.items()}
     for name, percent in growth.items():
         print(f"memory of the {name:14} {memory[name][-1] / 1024:7.1f} MB, growth {percent:+.1f} %")
