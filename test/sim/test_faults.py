@@ -151,10 +151,11 @@ class TestSoak:
         monkeypatch.setattr(soak, "node_command", noted)
         numbers = tmp_path / "soak.json"
         processor = min(os.sched_getaffinity(0))
-        arguments = f"--minutes 0.1 --priority 7 --processor {processor} --growth 1000 --json".split()
+        arguments = f"--minutes 0.1 --priority 7 --processor {processor} --growth 1e6 --json".split()
         code = soak.main([*arguments, str(numbers)])
         found = json.loads(numbers.read_text())
-        # How busy the machine is while tests run is not for them to say; that nothing was lost is.
+        # Six seconds of starting up say nothing about memory, and how busy the machine is while tests run is not for
+        # them to say; that nothing was lost is.
         assert [problem for problem in found["problems"] if "late steps" not in problem] == []
         assert code == bool(found["problems"])
         assert found["late_by_itself"] <= found["late"] < found["steps"]
