@@ -39,6 +39,11 @@ def run(module: str, interrupted: int) -> int:
         return int(main())
     except KeyboardInterrupt:
         return interrupted
+    finally:
+        # The work is done. A terminal and `ros2 launch` may both pass one Ctrl-C on, and the second would kill an
+        # interpreter that is clearing up, which looks like a crash.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
 
 
 def power_manager() -> int:

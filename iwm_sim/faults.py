@@ -29,6 +29,7 @@ from iwm_power_manager import files
 from iwm_power_manager.control.supervision import MODE_NORMAL
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.nodes import power_manager_config as config
+from iwm_power_manager.ros import ending
 from iwm_power_manager.ros import messages as m
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
@@ -405,8 +406,9 @@ def session_of(folder: Path, sim_time: bool, plan: Plan) -> Iterator[Session]:
                 finally:
                     session.relieve()
         finally:
-            node.close()
-            rclpy.shutdown(context=context)
+            with ending.one_processor():
+                node.close()
+                rclpy.shutdown(context=context)
 
 
 def show(result: Result) -> str:

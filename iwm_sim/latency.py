@@ -29,8 +29,8 @@ from rclpy.node import Node
 from iwm_power_manager import files
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.errors import IwmError
+from iwm_power_manager.ros import ending, qos
 from iwm_power_manager.ros import messages as m
-from iwm_power_manager.ros import qos
 from iwm_power_manager.ros.intake import Intake
 from iwm_sim.domains import claimed_domain
 from iwm_sim.processes import Children
@@ -190,13 +190,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": folder}
         os.environ |= own
         rclpy.init(args=[], domain_id=domain)
+        code = 1
         try:
-            return _run(chosen, os.environ | {"ROS_DOMAIN_ID": str(domain)}, Path(folder))
+            code = _run(chosen, os.environ | {"ROS_DOMAIN_ID": str(domain)}, Path(folder))
         except IwmError as error:
             print(f"latency: {error}", file=sys.stderr)
-            return 1
         finally:
-            rclpy.shutdown()
+            with ending.bounded(code):
+                pass
+    return code
 
 
 def _run(chosen: argparse.Namespace, environment: Mapping[str, str], folder: Path) -> int:

@@ -1,4 +1,4 @@
-"""Learn a policy from recorded driving, and keep it only if it drives no worse: `learn_policy --help`.
+"""Learn a policy from recorded driving, and keep it only if it costs no more: `learn_policy --help`.
 
 Ten minutes of driving do not fill a transition matrix, and the driver's demand is no Markov chain. So how much a
 recording should count beside standard cycles cannot be told from the data alone; but it can be tried. Policies are
@@ -52,7 +52,8 @@ CYCLES = ("ftp75", "hwfet", "nycc")
 _TRACE_STEP_S = 1.0
 
 _DESCRIPTION = """\
-Learn a policy from recorded driving, and keep it only if it drives no worse than one of standard cycles.
+Learn a policy from recorded driving, and keep it only if it costs no more (energy and price of
+moves) than one of standard cycles.
 
 Policies are solved from the recorded drives alone and beside the cycles, a recorded second counting as much as several
 seconds of a cycle, or as a part of one. Each of them drives the recorded speed in simulation. The one with the least

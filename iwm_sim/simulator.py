@@ -33,8 +33,8 @@ from std_msgs.msg import Bool
 from iwm_power_manager.control.types import Wheels
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import IwmError
+from iwm_power_manager.ros import ending, qos
 from iwm_power_manager.ros import messages as m
-from iwm_power_manager.ros import qos
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.interruption import Interruption
@@ -409,6 +409,8 @@ def main(args: Sequence[str] | None = None) -> int:
     """Drive the cycle; returns the exit code: 0 at its end or on Ctrl-C, 1 with one line on an error."""
     interruption = Interruption()
     interruption.install()
+    node: Simulator | None = None
+    code = 0
     try:
         check_parameter_files(sys.argv if args is None else list(args))
         check_arguments("simulator", "A driver and a car on a drive cycle, seen through topics.", PARAMETERS, args)
@@ -424,15 +426,17 @@ def main(args: Sequence[str] | None = None) -> int:
         if node.done.done():
             node.done.result()
         executor.shutdown()
-        node.destroy_node()
     except KeyboardInterrupt:
         pass
     except (IwmError, RuntimeError) as error:  # RuntimeError: rcl's only word for a wrong --ros-args
         print(f"simulator: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
+        code = 1
     finally:
-        rclpy.try_shutdown()
-    return 0
+        with ending.bounded(code):
+            if node is not None:
+                node.destroy_node()
+                node = None
+    return code
 
 
 if __name__ == "__main__":

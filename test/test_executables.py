@@ -74,10 +74,12 @@ def test_where_ctrl_c_is_ignored_the_imports_ignore_it_too(tmp_path) -> None:
 
 @pytest.fixture
 def heeding_ctrl_c():
-    """SIGINT as Python has it by default, also where the tests run in a shell's background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """SIGINT as Python has it by default, also where the tests run in a shell's background; SIGTERM as it was."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.usefixtures("heeding_ctrl_c")
@@ -88,7 +90,32 @@ def test_ctrl_c_that_main_does_not_deal_with_gives_the_exit_code(monkeypatch) ->
 
     monkeypatch.setattr(executables.importlib, "import_module", lambda name: type(name, (), {"main": main}))
     assert executables.run("some.module", executables.INTERRUPTED) == 130
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+#: A command whose work is done, and an interpreter that takes its time to end.
+SLOW_END = """\
+import atexit, signal, sys, types
+from iwm_power_manager import executables
+def linger():
+    signal.signal(signal.SIGUSR1, lambda *_: None)
+    print("ending", flush=True)
+    while signal.sigwait([signal.SIGUSR1]) != signal.SIGUSR1:
+        pass
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1])
+sys.modules["some_module"] = types.SimpleNamespace(main=lambda: 0)
+atexit.register(linger)
+sys.exit(executables.run("some_module", executables.NODE_ENDED))
+"""
+
+
+def test_a_second_ctrl_c_while_the_interpreter_ends_is_no_crash() -> None:
+    process = subprocess.Popen([sys.executable, "-c", SLOW_END], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ending\n"
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
+        process.send_signal(number)
+    assert process.wait(60) == 0
 
 
 @pytest.mark.parametrize("module", [executables, sim_executables])

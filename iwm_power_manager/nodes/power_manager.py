@@ -35,11 +35,11 @@ from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.demand_log import DemandLog
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport
-from iwm_power_manager.ros import diagnostics, messages, qos, realtime
+from iwm_power_manager.ros import diagnostics, ending, messages, qos, realtime
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.interruption import Interruption
-from iwm_power_manager.ros.parameters import ParameterError, check_change, declare, unknown
+from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 
@@ -89,8 +89,6 @@ class PowerManager(LifecycleNode):
             problem = f"cpu_affinity: {error}"
         if problem:
             raise ParameterError(f"parameter {problem}")
-        for line in unknown(self, config.SPECS):
-            self.get_logger().warning(line)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._lockstep: bool = self._values["lockstep"]
@@ -533,26 +531,29 @@ def main(args: list[str] | None = None) -> int:
     interruption = Interruption()
     interruption.install()
     node: PowerManager | None = None
+    code = 1
     try:
         check_parameter_files(sys.argv if args is None else args)
         check_arguments("power_manager", "Splits the driver's power demand between four motors.", config.SPECS, args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PowerManager()
-        if node.get_parameter("autostart").value and not node.start():
-            return 1
-        interruption.started = True
-        _spin(node, interruption)
+        if not node.get_parameter("autostart").value or node.start():
+            interruption.started = True
+            _spin(node, interruption)
+            code = 0
+        elif interruption.requested:
+            code = 0  # a library has swallowed the KeyboardInterrupt and failed for it
     except KeyboardInterrupt:
-        pass  # ended before it had begun
+        code = 0  # ended before it had begun
     except (IwmError, RuntimeError) as error:
         print(f"power_manager: {str(error).splitlines()[0]}", file=sys.stderr)
-        return 1
     finally:
-        if node is not None:
-            node.stop()
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+        with ending.bounded(code):
+            if node is not None:
+                node.stop()
+                node.destroy_node()
+                node = None
+    return code
 
 
 def _spin(node: PowerManager, interruption: Interruption) -> None:

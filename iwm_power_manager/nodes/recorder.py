@@ -37,6 +37,7 @@ from ..bags.recover import recover
 from ..bags.writer import WriterOptions
 from ..errors import BagError, IwmError
 from ..files import content_sha256
+from ..ros import ending
 from ..ros.interruption import Interruption
 from ..ros.messages import (
     CLOCK,
@@ -138,7 +139,11 @@ class Recorder(Node):
         path = Path(values["output"] or datetime.now().strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
         self.recording = Recording(path, _options(values), _custom_data(values))
         if values["record"]:
-            self.recording.start()
+            try:
+                self.recording.start()
+            except BagError:
+                self.recording.close()  # its thread would keep this node, and with it DDS, alive
+                raise
 
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._ready_publisher = self.create_publisher(Bool, "~/ready", latched)
@@ -397,14 +402,23 @@ def _run_node(arguments: list[str]) -> int:
         rclpy.init(args=["recorder", *arguments], signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:  # rcl's only word for a wrong --ros-args
         raise ParameterError(" ".join(str(error).split())) from None
+    node: Recorder | None = None
+    code = 1
     try:
-        return _record(interruption)
+        node = Recorder()
+        _record(node, interruption)
+        code = 0
+    except IwmError as error:
+        print(f"recorder: {error}", file=sys.stderr)
     finally:
-        rclpy.try_shutdown()
+        with ending.bounded(code):
+            if node is not None:
+                node.destroy_node()
+                node = None
+    return code
 
 
-def _record(interruption: Interruption) -> int:
-    node = Recorder()
+def _record(node: Recorder, interruption: Interruption) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     spinning = threading.Thread(target=_spin, args=(executor,), name="executor", daemon=True)
@@ -415,8 +429,6 @@ def _record(interruption: Interruption) -> int:
     finally:
         executor.shutdown()
         spinning.join()
-        node.destroy_node()
-    return 0
 
 
 if __name__ == "__main__":

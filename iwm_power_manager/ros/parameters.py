@@ -118,8 +118,8 @@ class Spec(NamedTuple):
         return descriptor
 
 
-def declare(node: Node, specs: Iterable[Spec]) -> dict[str, Any]:
-    """Declare all parameters and return their values at start.
+def declare(node: Node, specs: Sequence[Spec]) -> dict[str, Any]:
+    """Declare all parameters, warn of those given that do not exist, and return their values at start.
 
     Raises
     ------
@@ -140,10 +140,12 @@ def declare(node: Node, specs: Iterable[Spec]) -> dict[str, Any]:
         if problem:
             raise ParameterError(f"parameter {problem}")
         values[spec.name] = _plain(value)
+    for line in _unknown(node, specs):
+        node.get_logger().warning(line)
     return values
 
 
-def unknown(node: Node, specs: Iterable[Spec]) -> list[str]:
+def _unknown(node: Node, specs: Sequence[Spec]) -> list[str]:
     """A line for each parameter given at start that the node does not have, with the nearest that it has.
 
     They are no error: a file may give one set of parameters to all nodes (`/**`).

@@ -24,6 +24,7 @@ from ..bags.mapping import topic_named
 from ..bags.reader import BagReader, Message
 from ..bags.replay import COMPUTED
 from ..errors import BagError
+from . import ending
 from .interruption import Interruption
 from .messages import CLOCK, clock_message
 from .raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET
@@ -74,16 +75,18 @@ def play(bag: BagReader, options: PlayOptions) -> int:
     interruption.install()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node("replay", enable_rosout=False, start_parameter_services=False)
+    code = 1
     try:
         player = _Player(node, bag, options, interruption)
         player.wait_for_listeners()
         while player.pass_once() and options.loop and not interruption.requested:
             pass
         player.finish()
+        code = 0
     finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+        with ending.bounded(code):
+            node.destroy_node()
+    return code
 
 
 class _Player:

@@ -82,6 +82,11 @@ def request(priority: int, processors: set[int], lock_memory: bool) -> list[str]
     return refused
 
 
+def give_up_priority() -> None:
+    """Every thread of this process back to the scheduling of ordinary programs."""
+    _for_every_thread(lambda thread: os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0)))
+
+
 def _for_every_thread(ask: Callable[[int], None]) -> str:
     """Ask something for every thread of this process; the first refusal in words, "" if there was none."""
     for name in os.listdir("/proc/self/task"):

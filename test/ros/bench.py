@@ -21,7 +21,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from iwm_power_manager.ros import messages, qos
+from iwm_power_manager.ros import ending, messages, qos
 
 PATIENCE_S = 60.0
 TRANSITIONS = {
@@ -136,8 +136,9 @@ class Bench:
     def close(self) -> None:
         """Leave the domain."""
         self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
+        with ending.one_processor():
+            self.node.destroy_node()
+            rclpy.shutdown(context=self.context)
 
     # Waiting
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -97,6 +99,24 @@ def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, monkeypatch) -> None
     assert running.stop(signal.SIGINT) == 0
     assert "Traceback" not in running.text()
     assert not any(cache.rglob("law.step-*.nbc")), "it went on compiling"
+
+
+#: A start that fails because a library makes something else of the KeyboardInterrupt, as a ctypes callback does.
+SWALLOWED = """
+import signal, sys
+from iwm_power_manager.nodes import power_manager
+def start(node):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        return False
+power_manager.PowerManager.start = start
+sys.exit(power_manager.main())
+"""
+
+
+def test_a_start_that_fails_of_ctrl_c_is_no_failure() -> None:
+    assert subprocess.run([sys.executable, "-c", SWALLOWED], timeout=PATIENCE_S, check=False).returncode == 0
 
 
 def test_a_parameter_that_does_not_exist_is_warned_about(start_pair) -> None:

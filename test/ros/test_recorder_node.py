@@ -31,6 +31,7 @@ from std_srvs.srv import Trigger
 from disk_helpers import on_small_disk
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.recover import recover
+from iwm_power_manager.ros import ending
 
 PATIENCE_S = 60.0
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -102,8 +103,9 @@ class Peer:
 
     def close(self) -> None:
         self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
+        with ending.one_processor():
+            self.node.destroy_node()
+            rclpy.shutdown(context=self.context)
 
 
 @pytest.fixture
@@ -433,6 +435,14 @@ def test_a_wrong_parameter_gets_one_line_and_exit_code_1(
     assert line in error
     assert len(error.strip().splitlines()) == 1
     assert error.startswith("recorder: ")
+
+
+def test_a_parameter_that_does_not_exist_is_warned_about(
+    tmp_path: Path, recorder: Callable[..., RecorderProcess]
+) -> None:
+    process = recorder(tmp_path / "bag", "topic:=[/speed]", "output:=/proc/none/bag")
+    process.process.wait(PATIENCE_S)
+    assert "parameter topic is unknown and has no effect; is topics meant?" in process.end()[1]
 
 
 def test_the_recover_command_needs_no_ros_and_says_what_was_lost(tmp_path: Path) -> None:

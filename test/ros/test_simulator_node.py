@@ -17,8 +17,8 @@ from rclpy.node import Node
 
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.files import read_yaml
+from iwm_power_manager.ros import ending, qos
 from iwm_power_manager.ros import messages as m
-from iwm_power_manager.ros import qos
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import simulator
@@ -109,8 +109,9 @@ class StandIn:
 
     def close(self) -> None:
         self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.shutdown(context=self.context)
+        with ending.one_processor():
+            self.node.destroy_node()
+            rclpy.shutdown(context=self.context)
         self.running.process.kill()
         self.running.process.wait()
 
@@ -301,6 +302,13 @@ def test_what_it_cannot_work_with_gives_one_line_and_exit_code_1(capfd, monkeypa
     assert expected in lines[0]
 
 
+def test_a_parameter_that_does_not_exist_is_warned_about(capfd, monkeypatch) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    given = arguments({"cycle": "udds", "cycle_file": "/nowhere.csv"}, {"__ns": f"/alone_{os.getpid()}"})
+    assert simulator.main(["simulator", *given]) == 1
+    assert "parameter cycle is unknown and has no effect; is cycle_file meant?" in capfd.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("args", "code", "expected"),
     [
@@ -366,8 +374,9 @@ def test_topics_follow_namespace_and_remaps(tmp_path, hill) -> None:
         running.process.kill()
         running.process.wait()
         executor.shutdown()
-        node.destroy_node()
-        rclpy.shutdown(context=context)
+        with ending.one_processor():
+            node.destroy_node()
+            rclpy.shutdown(context=context)
 
 
 def test_the_shipped_parameter_file_holds_its_defaults() -> None:

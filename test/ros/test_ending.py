@@ -1,0 +1,119 @@
+"""Leaving DDS: a process that has done its work ends, in time and with its exit code."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from bench import Bench, arguments
+
+from iwm_power_manager.ros import ending, realtime
+
+#: Sleeps in C with the interpreter's lock in hand, as a destructor of Fast DDS may.
+STUCK = """
+import ctypes, sys
+from iwm_power_manager.ros import ending
+with ending.bounded({code}, 0.3):
+    ctypes.PyDLL(None).pause()
+"""
+
+#: Runs a node's `main` and tells which threads of DDS it leaves to the interpreter's end.
+REMAINS = """
+import importlib, os, sys
+code = importlib.import_module(sys.argv.pop(1)).main()
+names = [open(f"/proc/self/task/{thread}/comm").read().strip() for thread in os.listdir("/proc/self/task")]
+print("exit code", code)
+print("left", [name for name in names if name.startswith("dds.") and name != "dds.shm.wdog"])
+"""
+
+
+def run(code: str, *args: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True, timeout=60, check=False)
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_a_destructor_that_never_returns_does_not_keep_the_process(code) -> None:
+    ended = run(STUCK.format(code=code))
+    assert (ended.returncode, ended.stdout, ended.stderr) == (code, "", "")
+
+
+def test_who_has_left_in_time_goes_on() -> None:
+    with ending.bounded(9, 0.2):
+        left = True
+    time.sleep(0.4)  # nothing to wait for: it is the timer that must not come
+    assert left
+
+
+def test_what_went_wrong_is_not_hidden() -> None:
+    with pytest.raises(ZeroDivisionError), ending.bounded(9):
+        raise ZeroDivisionError
+
+
+def test_all_threads_share_a_processor_until_dds_is_left() -> None:
+    end = threading.Event()
+    other = threading.Thread(target=end.wait)
+    other.start()
+    assert other.native_id is not None
+    threads = [threading.get_native_id(), other.native_id]
+    before = [os.sched_getaffinity(thread) for thread in threads]
+    try:
+        with ending.one_processor():
+            chosen = [os.sched_getaffinity(thread) for thread in threads]
+        assert [os.sched_getaffinity(thread) for thread in threads] == before
+    finally:
+        end.set()
+        other.join()
+    assert len(chosen[0]) == 1
+    assert chosen[0] == chosen[1]
+    assert chosen[0] <= before[0]
+
+
+def test_a_thread_that_may_not_be_moved_stays(monkeypatch) -> None:
+    def refuse(_thread: int, _processors: set[int]) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    with ending.one_processor():
+        pass
+
+
+def test_leaving_is_not_done_at_a_priority_over_others(monkeypatch) -> None:
+    asked = {}
+    monkeypatch.setattr(os, "sched_setscheduler", lambda thread, policy, param: asked.update({thread: (policy, param)}))
+    realtime.give_up_priority()
+    assert asked[threading.get_native_id()] == (os.SCHED_OTHER, os.sched_param(0))
+    assert len(asked) == len(os.listdir("/proc/self/task"))
+
+
+@pytest.mark.parametrize(
+    ("module", "parameters", "code"),
+    [
+        ("iwm_power_manager.nodes.power_manager", {"policy_file": ""}, 1),  # there is a node, it does not start
+        ("iwm_power_manager.nodes.power_manager", {"rate_hz": 1e6}, 1),  # there is half a node
+        ("iwm_power_manager.nodes.recorder", {"output": "/proc/nowhere/bag"}, 1),
+        ("iwm_sim.simulator", {"cycle_file": "/nowhere.csv"}, 1),
+    ],
+)
+def test_a_node_that_cannot_start_leaves_no_dds_to_the_end_of_the_interpreter(module, parameters, code) -> None:
+    ended = run(REMAINS, module, *arguments(parameters))
+    assert ended.stdout == f"exit code {code}\nleft []\n", ended.stderr
+
+
+def test_a_node_that_has_run_leaves_no_dds_to_the_end_of_the_interpreter(compiled_law) -> None:
+    namespace = f"/ending_{os.getpid()}"
+    bench = Bench(int(os.environ["ROS_DOMAIN_ID"]), namespace=namespace)
+    given = arguments({"policy_file": "", "strategy": "equal"}, {"__ns": namespace})
+    node = "iwm_power_manager.nodes.power_manager"
+    process = subprocess.Popen([sys.executable, "-c", REMAINS, node, *given], stdout=subprocess.PIPE, text=True)
+    try:
+        bench.spin_until(lambda: bench.torques, "a command")
+    finally:
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=60)
+        bench.close()
+    assert output == "exit code 0\nleft []\n"
