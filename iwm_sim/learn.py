@@ -52,8 +52,7 @@ CYCLES = ("ftp75", "hwfet", "nycc")
 _TRACE_STEP_S = 1.0
 
 _DESCRIPTION = """\
-Learn a policy from recorded driving, and keep it only if it costs no more (energy and price of
-moves) than one of standard cycles.
+Learn a policy from recorded driving, and keep it only if it costs no more than one of standard cycles.
 
 Policies are solved from the recorded drives alone and beside the cycles, a recorded second counting as much as several
 seconds of a cycle, or as a part of one. Each of them drives the recorded speed in simulation. The one with the least

@@ -3,10 +3,11 @@
 A deadline can be missed because the program took too long, or because it was not run: the operating system gave the
 processor to somebody else, or, on a virtual machine, the host took the processor away. The witness tells the second
 kind, in two ways. As long as the watched process wants to run, what it was not given is the time on the clock less the
-processor time it used; the kernel's account of that leaves out what a host took away, be it slices of a tenth of a
-millisecond. While the process sleeps, a process of the witness's own on its processor sleeps, too, from half a
-millisecond to the next, at real-time priority where that is allowed: when it wakes too late, nothing of less priority
-can have run or been woken there either.
+processor time it used. But a host that takes a processor away does not always say so, and then the kernel books that
+time as used by whoever was on it. So a process of the witness's own wakes on that processor every half a millisecond,
+at a higher real-time priority: from the time it is to wake until it sleeps again nothing else runs there, whatever the
+books say (test/sim/test_witness.py has a process that looks). It sees only what meets one of its wake-ups: the machine
+took no less than it says. The same wake-ups tell what held the watched process up when it was to be woken itself.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 _TICK_S = 0.0005
 #: Later than this is no ordinary wake-up: on an idle machine one of a thousand takes so long.
 _LATE_S = 0.00025
@@ -32,12 +36,12 @@ _LATE_S = 0.00025
 _LOOK_S = 0.001
 #: Above every other thread that asks for real time here; normal priority where that is refused.
 _PRIORITY = 60
-_COLUMNS = 4
+_WAKE_UP_COLUMNS = 3
 _REAL_TIME, _NORMAL = b"real-time\n", b"normal\n"
 
 
 class Stall(NamedTuple):
-    """A processor stood still: from when its witness was to wake until it did, wall-clock s."""
+    """A processor stood still: from when its witness was to wake until it did, much too late, wall-clock s."""
 
     begin_s: float
     end_s: float
@@ -72,6 +76,8 @@ class Witness:
     ----------
     processes : that watch: one for each processor, one for the watched process
     stalls : by processor, in the order of time; there once the witness has stopped, like all that follows
+    withheld : by processor, shape (n, 2): times of which each wake-up of its witness kept everything else off it, from
+        when it was due until it slept again, wall-clock s; empty without real-time priority
     looks : at the watched process, in the order of time
     real_time : the witnesses ran at real-time priority: what they missed, any other thread on their processor missed
     """
@@ -81,6 +87,7 @@ class Witness:
         self._processors = sorted(os.sched_getaffinity(0) if processors is None else processors)
         self.processes: list[subprocess.Popen[bytes]] = []
         self.stalls: dict[int, list[Stall]] = {}
+        self.withheld: dict[int, NDArray[np.float64]] = {}
         self.looks: list[Look] = []
         self.real_time = True
 
@@ -102,36 +109,53 @@ class Witness:
             numbers.frombytes(process.communicate()[0])
             found.append(numbers)
         *by_processor, seen = found
-        self.stalls = {
-            processor: [Stall(*pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
-            for processor, numbers in zip(self._processors, by_processor, strict=True)
-        }
-        columns = (seen[column::_COLUMNS] for column in range(_COLUMNS))
+        for processor, numbers in zip(self._processors, by_processor, strict=True):
+            due_s, woke_s, slept_s = np.frombuffer(numbers).reshape(-1, _WAKE_UP_COLUMNS).T
+            late = woke_s - due_s > _LATE_S
+            self.stalls[processor] = [Stall(*pair) for pair in zip(due_s[late], woke_s[late], strict=True)]
+            self.withheld[processor] = np.column_stack([due_s, slept_s])[: None if self.real_time else 0]
+        columns = (seen[column :: len(Look._fields)] for column in range(len(Look._fields)))
         self.looks = [Look(*row) for row in zip(*columns, strict=True)]
 
     def machine_s(self, begin_s: float, end_s: float) -> float:
         """Time between two wall-clock times that the machine took, s.
 
-        From one look to the next, what the process was not given while it wanted to run all the time, else the stalls
-        of its processor. Of a process that moves between processors it is the longer of what each says, the least the
-        machine took: it is on one at a time, and stalls of two would explain too much when added up.
+        From one look to the next in which the process wanted to run all the time: what it was not given, or what was
+        withheld from everything on its processor, whichever is longer, since either may be a part of the other. Where
+        it woke: the stall it woke in, as far as it slept through it. Where it slept all the time: nothing. Where nobody
+        looked: the stalls. Of a process that moves between processors it is the longest of what each says: it is on one
+        at a time, and stalls of two would explain too much when added up.
         """
-        return max((self._taken_s(stalls, begin_s, end_s) for stalls in self.stalls.values()), default=0.0)
+        return max((self._taken_s(processor, begin_s, end_s) for processor in self.stalls), default=0.0)
 
-    def _taken_s(self, stalls: list[Stall], begin_s: float, end_s: float) -> float:
+    def _taken_s(self, processor: int, begin_s: float, end_s: float) -> float:
+        stalls = np.array(self.stalls[processor], dtype=float).reshape(-1, 2)
+        withheld = self.withheld.get(processor, stalls[:0])
         total_s, reached_s = 0.0, begin_s
+        asleep_since_s: float | None = None
         first = max(bisect_right(self.looks, begin_s, key=lambda look: look.time_s) - 1, 0)
         for before, after in itertools.pairwise(self.looks[first:]):
+            from_s, to_s = max(before.time_s, begin_s), min(after.time_s, end_s)
             if before.time_s >= end_s:
                 break
-            inside_s = min(after.time_s, end_s) - max(before.time_s, begin_s)
-            if inside_s <= 0.0 or not before.wants_to_run or after.sleeps != before.sleeps:
+            if to_s <= from_s:
                 continue
-            # A stretch in which it wanted to run all the time; what lies before it goes by the stalls.
-            total_s += _overlap_s(stalls, reached_s, max(before.time_s, begin_s))
-            lasted_s = after.time_s - before.time_s
-            total_s += max(lasted_s - (after.used_s - before.used_s), 0.0) * inside_s / lasted_s
-            reached_s = min(after.time_s, end_s)
+            total_s += _overlap_s(stalls, reached_s, from_s)
+            reached_s = to_s
+            slept = after.sleeps != before.sleeps
+            if before.wants_to_run and not slept:
+                asleep_since_s = None
+                lasted_s = after.time_s - before.time_s
+                not_given_s = max(lasted_s - (after.used_s - before.used_s), 0.0) * (to_s - from_s) / lasted_s
+                total_s += max(not_given_s, _overlap_s(withheld, from_s, to_s))
+            elif not before.wants_to_run and not after.wants_to_run and not slept:
+                asleep_since_s = from_s if asleep_since_s is None else asleep_since_s
+            else:
+                since_s = from_s if asleep_since_s is None else asleep_since_s
+                # A stall that was over while it still slept held nothing up.
+                lasting = stalls[stalls[:, 1] > from_s]
+                total_s += _overlap_s(lasting, since_s, to_s)
+                asleep_since_s = None
         return total_s + _overlap_s(stalls, reached_s, end_s)
 
     def summary(self) -> str:
@@ -145,30 +169,26 @@ class Witness:
         )
 
 
-def _overlap_s(stalls: list[Stall], begin_s: float, end_s: float) -> float:
-    first = bisect_right(stalls, begin_s, key=lambda stall: stall.end_s)
-    total_s = 0.0
-    for stall in stalls[first:]:
-        if stall.begin_s >= end_s:
-            break
-        total_s += min(stall.end_s, end_s) - max(stall.begin_s, begin_s)
-    return total_s
+def _overlap_s(spans: NDArray[np.float64], begin_s: float, end_s: float) -> float:
+    """Time between `begin_s` and `end_s` that lies in spans: shape (n, 2), in the order of time, none in another."""
+    near = spans[np.searchsorted(spans[:, 1], begin_s) : np.searchsorted(spans[:, 0], end_s)]
+    return float(np.sum(np.maximum(np.minimum(near[:, 1], end_s) - np.maximum(near[:, 0], begin_s), 0.0)))
 
 
-def _watch_processor(processor: int, stopped: Callable[[], bool]) -> array[float]:
-    """Begin and end of each stall, one after the other."""
+def _watch_processor(_processor: int, stopped: Callable[[], bool]) -> array[float]:
+    """When each wake-up was due, when it came, when it was over; one after the other."""
     found = array("d")
     due = time.monotonic()
     while not stopped():
         due += _TICK_S
         time.sleep(max(due - time.monotonic(), 0.0))
         behind = time.monotonic() - due
-        if behind > _LATE_S:
-            now = time.time()
-            found.append(now - behind)
-            found.append(now)
-            # Stays on the grid: of a stall that follows at once, as little as possible is slept through.
-            due += behind - behind % _TICK_S
+        now = time.time()
+        found.append(now - behind)
+        found.append(now)
+        # Stays on the grid: of a stall that follows at once, as little as possible is slept through.
+        due += behind - behind % _TICK_S
+        found.append(time.time())
     return found
 
 

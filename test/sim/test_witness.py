@@ -9,9 +9,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from iwm_sim.witness import Look, Stall, Witness
+from iwm_sim.witness import Look, Stall, Witness, _overlap_s
 
 #: Wants the processor it is given all the time.
 BUSY = "import os, sys; os.sched_setaffinity(0, {int(sys.argv[1])})\nwhile True: pass"
@@ -64,6 +65,69 @@ def test_time_it_used_itself_is_not_the_machines() -> None:
     witness = witness_of([])
     witness.looks = [Look(1.0, 7.0, 3, 1), Look(1.2, 7.2, 3, 1), Look(1.3, 7.31, 3, 1)]
     assert witness.machine_s(1.0, 1.3) == 0.0
+
+
+def test_what_was_withheld_counts_although_the_kernel_booked_it_as_used() -> None:
+    witness = witness_of([])
+    witness.looks = [Look(1.0, 7.0, 3, 1), Look(1.2, 7.2, 3, 1), Look(1.4, 7.3, 3, 1), Look(1.6, 7.5, 4, 1)]
+    witness.withheld[0] = np.array([[0.9, 1.05], [1.1, 1.12], [1.25, 1.27], [1.45, 1.5]])
+    assert witness.machine_s(1.0, 1.2) == pytest.approx(0.07)
+    assert witness.machine_s(1.04, 1.11) == pytest.approx(0.02)
+    assert witness.machine_s(1.2, 1.4) == pytest.approx(0.1)  # it was not given 0.1, and 0.02 may be a part of that
+    assert witness.machine_s(1.4, 1.6) == 0.0  # it slept
+
+
+def test_a_stall_counts_only_if_it_woke_in_it() -> None:
+    stalls = [Stall(1.05, 1.15), Stall(1.21, 1.55), Stall(1.61, 1.64)]
+    witness = witness_of(stalls)
+    asleep = [Look(1.0 + 0.1 * i, 7.0, 3, 0) for i in range(6)]
+    witness.looks = [*asleep, Look(1.6, 7.01, 3, 1), Look(1.7, 7.11, 3, 1)]
+    assert witness.machine_s(1.0, 1.7) == pytest.approx(0.34)  # the first was over while it slept, the last is booked
+    assert witness.machine_s(1.3, 1.7) == pytest.approx(0.25)
+    assert witness.machine_s(1.0, 1.5) == 0.0
+    witness.looks[6] = Look(1.6, 7.01, 4, 0)  # it woke and slept again
+    assert witness.machine_s(1.0, 1.6) == pytest.approx(0.34)
+    witness.looks = asleep
+    assert witness.machine_s(1.0, 9.0) == pytest.approx(0.05 + 0.03)  # nobody looked after 1.5
+
+
+#: Writes down from when to when it could not read the clock.
+CLOCK_READER = """
+import array, gc, os, signal, sys, time
+os.sched_setaffinity(0, {int(sys.argv[1])})
+gc.disable()
+found, ended = array.array("d"), []
+signal.signal(signal.SIGTERM, lambda *_: ended.append(1))
+print("reading", flush=True)
+last = time.time()
+while not ended:
+    now = time.time()
+    if now - last > 1e-5:
+        found.append(last)
+        found.append(now)
+    last = now
+sys.stdout.buffer.write(found.tobytes())
+"""
+
+
+def test_while_the_witness_is_to_run_nothing_else_does() -> None:
+    processor = max(os.sched_getaffinity(0))
+    reader = subprocess.Popen([sys.executable, "-c", CLOCK_READER, str(processor)], stdout=subprocess.PIPE)
+    assert reader.stdout is not None
+    assert reader.stdout.readline() == b"reading\n"
+    with Witness(reader.pid, {processor}) as witness:
+        time.sleep(1.0)  # what is to be seen has to happen first
+    reader.terminate()
+    gaps = np.frombuffer(reader.communicate()[0]).reshape(-1, 2)
+    withheld = witness.withheld[processor]
+    if not witness.real_time:
+        assert len(withheld) == 0  # it cannot know
+        return
+    assert len(withheld) > 1000
+    lasted_s = withheld[:, 1] - withheld[:, 0]
+    assert np.all(lasted_s > 0.0) and np.all(withheld[1:, 0] >= withheld[:-1, 1] - 1e-4)
+    without_clock_s = sum(_overlap_s(gaps, *span) for span in withheld)
+    assert without_clock_s > 0.95 * lasted_s.sum()
 
 
 @pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the kernel does not tell how long tasks wait")
