@@ -1,11 +1,12 @@
 """Learn a policy from recorded driving, and keep it only if it costs no more: `learn_policy --help`.
 
 Ten minutes of driving do not fill a transition matrix, and the driver's demand is no Markov chain. So how much a
-recording should count beside standard cycles cannot be told from the data alone; but it can be tried. Policies are
-solved with the recorded drive at several weights, and each drives what was recorded in the closed loop. What costs
-least of what the solver minimizes, energy and the price of moving the split, is written; if that is no less than what
-the cycles alone would cost, theirs is. (Laroche et al. 2019, *Safe policy improvement with baseline bootstrapping*,
-fall back on a baseline where data are few; here, as a whole.)
+recording should count beside standard cycles, and how dear a move should be to a solver that does not know the
+driver's next one, cannot be told from the data alone; but it can be tried. Policies are solved with the recorded drive
+at several weights and prices, and each drives what was recorded in the closed loop. Of those that need no more energy
+than the policy of the cycles alone, the one that costs least of what the solver minimizes, energy and the true price of
+moving the split, is written; if that is no less than what the cycles' policy costs, theirs is. (Laroche et al. 2019,
+*Safe policy improvement with baseline bootstrapping*, fall back on a baseline where data are few; here, as a whole.)
 
 Exit codes: 0 done; 2 bad arguments or files; 130 interrupted.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import math
 import sys
@@ -47,17 +49,20 @@ DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 #: Weights of a recorded second beside a second of a cycle. 0: the cycles alone; infinite: the recording alone.
 CYCLES_ALONE, RECORDING_ALONE = 0.0, math.inf
 WEIGHTS = (0.05, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0, RECORDING_ALONE)
+#: What a move costs the solver, of its true price. Only the true one is judged by.
+PRICES = (0.8, 0.9, 1.0, 1.1)
 CYCLES = ("ftp75", "hwfet", "nycc")
 #: A recorded speed is followed from second to second, like a standard cycle: noise is no wish of the driver's.
 _TRACE_STEP_S = 1.0
 
 _DESCRIPTION = """\
-Learn a policy from recorded driving, and keep it only if it costs no more than one of standard cycles.
+Learn a policy from recorded driving, and keep it only if it is no worse than one of standard cycles.
 
 Policies are solved from the recorded drives alone and beside the cycles, a recorded second counting as much as several
-seconds of a cycle, or as a part of one. Each of them drives the recorded speed in simulation. The one with the least
-cost is written: energy, and the price of moving the split, which is what policies are solved for. If none of them costs
-less than the cycles' own policy, that one is written.
+seconds of a cycle, or as a part of one, and with moves of the split a little cheaper or dearer than they are. Each of
+them drives the recorded speed in simulation. Of those that need no more energy than the cycles' own policy, the one
+with the least cost is written: energy, and the true price of moving the split, which is what policies are solved for.
+If none costs less than the cycles' policy, that one is written.
 """
 
 _EXAMPLES = """\
@@ -82,13 +87,15 @@ class Outcome(NamedTuple):
     Attributes
     ----------
     weight : of a recorded second beside a second of a cycle
+    price : of a move in the solver, as a multiple of the true one
     energy_wh_per_km : out of the cells
-    moves_wh_per_km : price of moving the split, in the same unit
+    moves_wh_per_km : true price of moving the split, in the same unit
     changes_per_min : changes of the split that count
     trace_held : on every drive
     """
 
     weight: float
+    price: float
     energy_wh_per_km: float
     moves_wh_per_km: float
     changes_per_min: float
@@ -101,7 +108,7 @@ class Outcome(NamedTuple):
 
 
 class Task(NamedTuple):
-    """All that is needed to solve and drive at one weight."""
+    """All that is needed to solve and drive at one weight and price."""
 
     problem: Problem
     vehicle: Vehicle
@@ -142,22 +149,32 @@ def sources_at(weight: float, recorded: Sequence[Source], general: Sequence[Sour
     return [dataclasses.replace(source, weight=weight) for source in recorded] + list(general)
 
 
-def policy_path(folder: str, weight: float) -> Path:
-    """Where the policy of a weight is while it is tried."""
-    return Path(folder) / f"weight_{weight:g}.npz"
+def priced(problem: Problem, price: float) -> Problem:
+    """The problem with moves at a multiple of their price."""
+    by_friction = tuple((friction, cost_j * price) for friction, cost_j in problem.switching_cost_by_friction)
+    return dataclasses.replace(
+        problem, switching_cost_j=problem.switching_cost_j * price, switching_cost_by_friction=by_friction
+    )
 
 
-def try_weight(weight: float, task: Task) -> Outcome:
-    """Solve with the recording at a weight, and drive."""
+def policy_path(folder: str, weight: float, price: float) -> Path:
+    """Where the policy of a weight and a price is while it is tried."""
+    return Path(folder) / f"weight_{weight:g}_price_{price:g}.npz"
+
+
+def try_candidate(candidate: tuple[float, float], task: Task) -> Outcome:
+    """Solve with the recording at a weight and moves at a price, and drive."""
+    weight, price = candidate
+    problem = priced(task.problem, price)
     sources = sources_at(weight, task.recorded, task.general)
-    chain = chain_of(task.problem, sources)
-    path = policy_path(task.folder, weight)
-    solved = solve_one(task.problem, task.vehicle, task.friction, chain, sources, path)
-    price_j = task.problem.on_road(task.friction).switching_cost_j
-    return drive_all(weight, "sdp_lookahead", solved.policy.table(), price_j, task)
+    chain = chain_of(problem, sources)
+    path = policy_path(task.folder, weight, price)
+    solved = solve_one(problem, task.vehicle, task.friction, chain, sources, path)
+    true_price_j = task.problem.on_road(task.friction).switching_cost_j
+    return drive_all(candidate, "sdp_lookahead", solved.policy.table(), true_price_j, task)
 
 
-def drive_all(weight: float, strategy: str, table: PolicyTable, price_j: float, task: Task) -> Outcome:
+def drive_all(candidate: tuple[float, float], strategy: str, table: PolicyTable, price_j: float, task: Task) -> Outcome:
     """Drive every drive with a strategy."""
     energy_wh = moves_wh = distance_m = minutes = changes = 0.0
     held = True
@@ -174,11 +191,11 @@ def drive_all(weight: float, strategy: str, table: PolicyTable, price_j: float, 
     if distance_m <= 0.0:
         raise ConfigError(", ".join(cycle.source for cycle in task.drives), "", "the car does not move")
     per_km = 1000.0 / distance_m
-    return Outcome(weight, energy_wh * per_km, moves_wh * per_km, changes / minutes, held)
+    return Outcome(*candidate, energy_wh * per_km, moves_wh * per_km, changes / minutes, held)
 
 
 def choose(outcomes: Sequence[Outcome]) -> Outcome:
-    """The outcome with the least cost; of equal ones, and where the others do not hold the trace, the cycles'.
+    """The least cost of those that need no more energy than the cycles' and hold the trace; else the cycles'.
 
     Parameters
     ----------
@@ -186,32 +203,40 @@ def choose(outcomes: Sequence[Outcome]) -> Outcome:
     """
     (safe,) = (outcome for outcome in outcomes if outcome.weight == CYCLES_ALONE)
     # Energy that was saved by not following the trace is no saving.
-    fair = [outcome for outcome in outcomes if outcome.trace_held or not safe.trace_held]
+    fair = [
+        outcome
+        for outcome in outcomes
+        if outcome.energy_wh_per_km <= safe.energy_wh_per_km and (outcome.trace_held or not safe.trace_held)
+    ]
     best = min(fair, key=lambda outcome: outcome.cost_wh_per_km)
     return best if best.cost_wh_per_km < safe.cost_wh_per_km else safe
 
 
-def learn(task: Task, weights: Sequence[float], jobs: int, quiet: bool) -> tuple[Outcome, list[Outcome], Policy]:
-    """Try the weights on one road.
+def learn(
+    task: Task, weights: Sequence[float], prices: Sequence[float], jobs: int, quiet: bool
+) -> tuple[Outcome, list[Outcome], Policy]:
+    """Try weights and prices on one road.
 
     Returns
     -------
-    equal split, every weight from the smallest to the greatest, and the policy of the chosen one
+    equal split; the cycles alone and then every weight from the smallest to the greatest, at every price; and the
+    policy of the chosen one
     """
-    order = sorted({CYCLES_ALONE, *weights})
+    order = [(CYCLES_ALONE, 1.0), *itertools.product(sorted(set(weights)), sorted(set(prices)))]
     with tqdm(
         total=len(order), desc=f"friction {task.friction:g}", unit="policy", file=sys.stderr, disable=quiet, leave=False
     ) as bar:
-        equal = drive_all(math.nan, "equal", empty_table(), 0.0, task)
+        equal = drive_all((math.nan, math.nan), "equal", empty_table(), 0.0, task)
         # The first one in this process: what it compiles, the others find in the cache.
-        outcomes = [try_weight(order[0], task)]
+        outcomes = [try_candidate(order[0], task)]
         bar.update()
 
         def done(_: Outcome) -> None:
             bar.update()
 
-        outcomes += on_all_cores(partial(try_weight, task=task), order[1:], jobs, done)
-    policy = load_policy(policy_path(task.folder, choose(outcomes).weight))
+        outcomes += on_all_cores(partial(try_candidate, task=task), order[1:], jobs, done)
+    chosen = choose(outcomes)
+    policy = load_policy(policy_path(task.folder, chosen.weight, chosen.price))
     return equal, outcomes, policy
 
 
@@ -243,6 +268,14 @@ def parser() -> argparse.ArgumentParser:
         help="a recorded second counts as W seconds of a cycle; inf: the bags alone "
         f"(default: {' '.join(f'{weight:g}' for weight in WEIGHTS)})",
     )
+    result.add_argument(
+        "--prices",
+        nargs="+",
+        type=float,
+        default=list(PRICES),
+        metavar="P",
+        help=f"a move costs the solver P times its price (default: {' '.join(f'{price:g}' for price in PRICES)})",
+    )
     result.add_argument("--grid", default="coupled", metavar="NAME|FILE", help="grid (default: %(default)s)")
     result.add_argument("--idle-drive", choices=sorted(IDLE_DRIVES), help="replaces the car's idle_drive")
     result.add_argument("--jobs", type=int, default=cores(), metavar="N", help="processes (default: one for each core)")
@@ -270,6 +303,9 @@ def _learn(options: argparse.Namespace) -> None:
     for weight in options.weights:
         if not weight > 0.0:
             raise ConfigError("arguments", "--weights", f"{weight:g} is out of range", "above 0, inf included")
+    for price in options.prices:
+        if not 0.0 < price < math.inf:
+            raise ConfigError("arguments", "--prices", f"{price:g} is out of range", "above 0 and finite")
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
     problem = load_grid(options.grid)
     frictions = [check_number("arguments", "--friction", value, 0.01, 2.0) for value in options.friction]
@@ -286,7 +322,7 @@ def _learn(options: argparse.Namespace) -> None:
     for friction, path in zip(frictions, paths, strict=True):
         with tempfile.TemporaryDirectory(prefix="iwm-learn-") as folder:
             task = Task(problem, vehicle, friction, recorded, general, drives, folder)
-            equal, outcomes, policy = learn(task, options.weights, max(options.jobs, 1), options.quiet)
+            equal, outcomes, policy = learn(task, options.weights, options.prices, max(options.jobs, 1), options.quiet)
         save_policy(policy, path)
         chosen = choose(outcomes)
         if not options.quiet:
@@ -297,6 +333,7 @@ def _learn(options: argparse.Namespace) -> None:
                 "policy": str(path),
                 "checksum": policy.checksum,
                 "chosen_weight": _named(chosen.weight),
+                "chosen_price": chosen.price,
                 "equal": _row(equal),
                 "outcomes": [_row(outcome) for outcome in outcomes],
             }
@@ -314,7 +351,8 @@ def _named(weight: float) -> float | str | None:
 
 
 def _row(outcome: Outcome) -> dict[str, float | str | bool | None]:
-    return {**outcome._asdict(), "weight": _named(outcome.weight), "cost_wh_per_km": outcome.cost_wh_per_km}
+    named = {"weight": _named(outcome.weight), "price": _named(outcome.price)}
+    return {**outcome._asdict(), **named, "cost_wh_per_km": outcome.cost_wh_per_km}
 
 
 def _text(task: Task, equal: Outcome, outcomes: Sequence[Outcome], chosen: Outcome, path: Path) -> str:
@@ -322,18 +360,31 @@ def _text(task: Task, equal: Outcome, outcomes: Sequence[Outcome], chosen: Outco
     lines = [
         f"friction {task.friction:g}, idle drive {task.vehicle.idle_drive}; driven: {drives}",
         f"equal split: {equal.energy_wh_per_km:.2f} Wh/km; saved by policies, %:",
-        "recorded second counts as   energy   with price of moves   changes/min   trace",
+        "recorded second counts as   moves at   energy   with price of moves   changes/min   trace",
     ]
-    for outcome in outcomes:
+    for outcome in _best_of_each_weight(outcomes, chosen):
         saved = 100.0 * (1.0 - outcome.energy_wh_per_km / equal.energy_wh_per_km)
         net = saved - 100.0 * outcome.moves_wh_per_km / equal.energy_wh_per_km
         lines.append(
-            f"{_weight_text(outcome.weight):<27} {saved:7.3f}   {net:19.3f}   {outcome.changes_per_min:11.1f}   "
+            f"{_weight_text(outcome.weight):<27} {outcome.price:8.2f}  {saved:7.3f}   {net:19.3f}   "
+            f"{outcome.changes_per_min:11.1f}   "
             f"{'held' if outcome.trace_held else 'left'}{'   <- chosen' if outcome is chosen else ''}"
         )
     if chosen.weight == CYCLES_ALONE:
         lines.append("the recorded drives teach nothing that the cycles do not; the policy is that of the cycles")
     return "\n".join([*lines, f"policy: {path}", ""])
+
+
+def _best_of_each_weight(outcomes: Sequence[Outcome], chosen: Outcome) -> list[Outcome]:
+    """Of each weight the price that does best by the rule of `choose`, or costs least where that leaves none."""
+    safe, *others = outcomes
+    best = [safe]
+    for _, group in itertools.groupby(others, key=lambda outcome: outcome.weight):
+        tried = list(group)
+        found = choose([safe, *tried])
+        best.append(found if found is not safe else min(tried, key=lambda outcome: outcome.cost_wh_per_km))
+    assert any(outcome is chosen for outcome in best)
+    return best
 
 
 def _weight_text(weight: float) -> str:

@@ -37,10 +37,14 @@ from iwm_sim.witness import Witness
 _RATE_HZ = 100.0
 _PERIOD_S = 1.0 / _RATE_HZ
 _SAMPLE_S = 5.0
+#: In Fast DDS's shared memory, whoever publishes may wait for a lock of a process that has just lost its processor.
+_NO_SHARED_MEMORY = ["env", "FASTDDS_BUILTIN_TRANSPORTS=UDPv4"]
 #: Memory is compared from here on: until then caches fill.
 _SETTLED = 0.2
 #: A step is late when it comes this many periods after the previous one.
 _LATE_PERIODS = 1.5
+#: So many times longer than usual is worth saying.
+_SLOW = 5.0
 _SIMULATED = (m.VEHICLE_SPEED, m.WHEEL_STATES, m.BATTERY_STATE, m.POWER_DEMAND, m.ACCELERATOR_PEDAL, m.BRAKE_PEDAL)
 
 
@@ -52,7 +56,7 @@ class Recorded(NamedTuple):
     counts : messages by topic
     step_ns : stamps of the power manager's steps
     skipped : steps whose state is not in the bag
-    uncommanded : steps without one of the two commands
+    uncommanded : steps without one of the two commands, from the first input on
     degraded : steps in another mode than normal, after the first normal one and while there were inputs
     """
 
@@ -70,13 +74,14 @@ def read_bag(path: Path) -> Recorded:
     step_ns: list[int] = []
     skipped, previous, normal = 0, -1, False
     degraded_ns: list[int] = []
-    last_input_ns = 0
+    first_input_ns, last_input_ns = 0, 0
     with BagReader(path) as bag:
         for message in bag.messages():
             topic = message.topic.lstrip("/")
             counts[topic] += 1
             if topic in _SIMULATED:
                 last_input_ns = message.log_time_ns
+                first_input_ns = first_input_ns or last_input_ns
             if topic not in commands and topic != m.POWER_MANAGER_STATE:
                 continue
             content = deserialize_message(message.data, JointState)
@@ -93,7 +98,8 @@ def read_bag(path: Path) -> Recorded:
                 degraded_ns.append(message.log_time_ns)
             step_ns.append(stamp_ns)
     last = step_ns[-1] if step_ns else 0
-    expected = set(step_ns)
+    # The recorder meets one publisher after the other, and only then lets the simulator begin.
+    expected = {stamp_ns for stamp_ns in step_ns if stamp_ns >= first_input_ns}
     uncommanded = sum(len(expected - {s for s in stamps if s <= last}) for stamps in commands.values())
     degraded = sum(time_ns <= last_input_ns for time_ns in degraded_ns)
     return Recorded(dict(counts), step_ns, skipped, uncommanded, degraded)
@@ -159,6 +165,15 @@ def growth_percent(samples_kb: Sequence[int]) -> float:
     return float(100.0 * (last / first - 1.0))
 
 
+def slow_memory(witness: Witness, step: LateStep, first_s: float) -> str:
+    """What the witness's own work says of the time before a late step; "" if nothing."""
+    end_s = first_s + step.time_s
+    longest_s, usual_s = witness.slowest_work_s(end_s - step.gap_s, end_s)
+    if longest_s <= _SLOW * usual_s:
+        return ""
+    return f"; the witness's own work took up to {1e6 * longest_s:.0f} us ({1e6 * usual_s:.0f} us usually)"
+
+
 @contextmanager
 def kept_off(processor: int | None) -> Iterator[None]:
     """The calling thread, and the processes it starts, leave a processor to others, unless it is the only one."""
@@ -173,8 +188,9 @@ def kept_off(processor: int | None) -> Iterator[None]:
 def drive(minutes: float, priority: int, processor: int | None, folder: Path) -> Driven:
     """Drive for some minutes.
 
-    With a real-time priority the power manager runs as docs/safety.md asks of a car: its memory is locked, too. On the
-    processor it is given, if any, nothing else of the soak runs but the witness, which then watches that one only.
+    With a real-time priority the power manager runs as docs/safety.md asks of a car: its memory is locked, and none of
+    it is shared with the others (`_NO_SHARED_MEMORY`). On the processor it is given, if any, nothing else of the soak
+    runs but the witness, which then watches that one only.
     """
     cycle = folder / "soak.csv"
     # Up and down between 5 and 15 m/s: drive and brake all the time.
@@ -188,7 +204,8 @@ def drive(minutes: float, priority: int, processor: int | None, folder: Path) ->
         recorder = children.start("recorder", node_command("recorder", {"output": str(bag)}))
         manager = children.start(
             "power manager",
-            node_command(
+            (_NO_SHARED_MEMORY if priority > 0 else [])
+            + node_command(
                 "power_manager",
                 {
                     "strategy": "equal",
@@ -275,7 +292,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for step in own:
         print(
             f"  at {step.time_s:.2f} s, {1000 * step.gap_s:.1f} ms after the previous one; "
-            f"the machine took {1000 * step.machine_s:.1f} ms"
+            f"the machine took {1000 * step.machine_s:.1f} ms" + slow_memory(witness, step, recorded.step_ns[0] / 1e9)
         )
     print(witness.summary())
     print(f"{recorded.degraded} steps in another mode than normal while there were inputs")

@@ -6,14 +6,16 @@ kind, in two ways. As long as the watched process wants to run, what it was not 
 processor time it used. But a host that takes a processor away does not always say so, and then the kernel books that
 time as used by whoever was on it. So a process of the witness's own wakes on that processor every half a millisecond,
 at a higher real-time priority: from the time it is to wake until it sleeps again nothing else runs there, whatever the
-books say (test/sim/test_witness.py has a process that looks). It sees only what meets one of its wake-ups: the machine
-took no less than it says. The same wake-ups tell what held the watched process up when it was to be woken itself.
+books say (test/sim/test_witness.py has a process that looks). Each time it does a little work that is always the same,
+on some pages of memory, which tells when these were slow (`Witness.slowest_work_s`; nothing is deducted for that). The
+same wake-ups tell what held the watched process up when it was to be woken itself.
 """
 
 from __future__ import annotations
 
 import gc
 import itertools
+import math
 import os
 import subprocess
 import sys
@@ -36,7 +38,9 @@ _LATE_S = 0.00025
 _LOOK_S = 0.001
 #: Above every other thread that asks for real time here; normal priority where that is refused.
 _PRIORITY = 60
-_WAKE_UP_COLUMNS = 3
+_WAKE_UP_COLUMNS = 4
+#: Written to at each wake-up, a byte of each page: memory can be slow when the processor is not.
+_PAGE, _PAGES = 4096, 64
 _REAL_TIME, _NORMAL = b"real-time\n", b"normal\n"
 
 
@@ -78,6 +82,7 @@ class Witness:
     stalls : by processor, in the order of time; there once the witness has stopped, like all that follows
     withheld : by processor, shape (n, 2): times of which each wake-up of its witness kept everything else off it, from
         when it was due until it slept again, wall-clock s; empty without real-time priority
+    work_s : by processor, shape (n,): how long the same little work took at each of these wake-ups
     looks : at the watched process, in the order of time
     real_time : the witnesses ran at real-time priority: what they missed, any other thread on their processor missed
     """
@@ -88,6 +93,7 @@ class Witness:
         self.processes: list[subprocess.Popen[bytes]] = []
         self.stalls: dict[int, list[Stall]] = {}
         self.withheld: dict[int, NDArray[np.float64]] = {}
+        self.work_s: dict[int, NDArray[np.float64]] = {}
         self.looks: list[Look] = []
         self.real_time = True
 
@@ -110,18 +116,20 @@ class Witness:
             found.append(numbers)
         *by_processor, seen = found
         for processor, numbers in zip(self._processors, by_processor, strict=True):
-            due_s, woke_s, slept_s = np.frombuffer(numbers).reshape(-1, _WAKE_UP_COLUMNS).T
+            due_s, woke_s, work_s, slept_s = np.frombuffer(numbers).reshape(-1, _WAKE_UP_COLUMNS).T
             late = woke_s - due_s > _LATE_S
             self.stalls[processor] = [Stall(*pair) for pair in zip(due_s[late], woke_s[late], strict=True)]
-            self.withheld[processor] = np.column_stack([due_s, slept_s])[: None if self.real_time else 0]
+            seen_by_all = slice(None if self.real_time else 0)
+            self.withheld[processor] = np.column_stack([due_s, slept_s])[seen_by_all]
+            self.work_s[processor] = work_s[seen_by_all]
         columns = (seen[column :: len(Look._fields)] for column in range(len(Look._fields)))
         self.looks = [Look(*row) for row in zip(*columns, strict=True)]
 
     def machine_s(self, begin_s: float, end_s: float) -> float:
         """Time between two wall-clock times that the machine took, s.
 
-        From one look to the next in which the process wanted to run all the time: what it was not given, or what was
-        withheld from everything on its processor, whichever is longer, since either may be a part of the other. Where
+        As long as it wanted to run: what it was not given, or what was withheld from everything on its processor,
+        whichever is longer, since either may be a part of the other. Where
         it woke: the stall it woke in, as far as it slept through it. Where it slept all the time: nothing. Where nobody
         looked: the stalls. Of a process that moves between processors it is the longest of what each says: it is on one
         at a time, and stalls of two would explain too much when added up.
@@ -130,8 +138,8 @@ class Witness:
 
     def _taken_s(self, processor: int, begin_s: float, end_s: float) -> float:
         stalls = np.array(self.stalls[processor], dtype=float).reshape(-1, 2)
-        withheld = self.withheld.get(processor, stalls[:0])
         total_s, reached_s = 0.0, begin_s
+        running_since_s, used_s = math.nan, 0.0
         asleep_since_s: float | None = None
         first = max(bisect_right(self.looks, begin_s, key=lambda look: look.time_s) - 1, 0)
         for before, after in itertools.pairwise(self.looks[first:]):
@@ -145,18 +153,39 @@ class Witness:
             slept = after.sleeps != before.sleeps
             if before.wants_to_run and not slept:
                 asleep_since_s = None
-                lasted_s = after.time_s - before.time_s
-                not_given_s = max(lasted_s - (after.used_s - before.used_s), 0.0) * (to_s - from_s) / lasted_s
-                total_s += max(not_given_s, _overlap_s(withheld, from_s, to_s))
-            elif not before.wants_to_run and not after.wants_to_run and not slept:
+                running_since_s = from_s if math.isnan(running_since_s) else running_since_s
+                used_s += (after.used_s - before.used_s) * (to_s - from_s) / (after.time_s - before.time_s)
+                continue
+            total_s += self._kept_s(processor, running_since_s, from_s, used_s)
+            running_since_s, used_s = math.nan, 0.0
+            if not before.wants_to_run and not after.wants_to_run and not slept:
                 asleep_since_s = from_s if asleep_since_s is None else asleep_since_s
             else:
                 since_s = from_s if asleep_since_s is None else asleep_since_s
-                # A stall that was over while it still slept held nothing up.
-                lasting = stalls[stalls[:, 1] > from_s]
+                # A stall that was over while it still slept held nothing up. Just after one, it has yet to be woken.
+                lasting = stalls[stalls[:, 1] > from_s - _TICK_S]
                 total_s += _overlap_s(lasting, since_s, to_s)
                 asleep_since_s = None
+        total_s += self._kept_s(processor, running_since_s, reached_s, used_s)
         return total_s + _overlap_s(stalls, reached_s, end_s)
+
+    def _kept_s(self, processor: int, begin_s: float, end_s: float, used_s: float) -> float:
+        """What the machine kept from the process while it wanted to run; 0 if it never began (NaN)."""
+        if math.isnan(begin_s):
+            return 0.0
+        withheld = self.withheld.get(processor, np.empty((0, 2)))
+        given_s = min(used_s, end_s - begin_s - _overlap_s(withheld, begin_s, end_s))
+        return end_s - begin_s - given_s
+
+    def slowest_work_s(self, begin_s: float, end_s: float) -> tuple[float, float]:
+        """How long the same little work took at most between two times, and how long it usually takes, s; else 0."""
+        longest_s, usual_s = 0.0, 0.0
+        for processor, work_s in self.work_s.items():
+            withheld = self.withheld[processor]
+            inside = work_s[np.searchsorted(withheld[:, 1], begin_s) : np.searchsorted(withheld[:, 0], end_s)]
+            if inside.size and inside.max() > longest_s:
+                longest_s, usual_s = float(inside.max()), float(np.median(work_s))
+        return longest_s, usual_s
 
     def summary(self) -> str:
         """What the machine did, in words."""
@@ -176,8 +205,9 @@ def _overlap_s(spans: NDArray[np.float64], begin_s: float, end_s: float) -> floa
 
 
 def _watch_processor(_processor: int, stopped: Callable[[], bool]) -> array[float]:
-    """When each wake-up was due, when it came, when it was over; one after the other."""
+    """When each wake-up was due, when it came, how long its work took, when it was over; one after the other."""
     found = array("d")
+    bytes_of_pages = np.zeros(_PAGES * _PAGE, dtype=np.uint8)[::_PAGE]
     due = time.monotonic()
     while not stopped():
         due += _TICK_S
@@ -186,6 +216,9 @@ def _watch_processor(_processor: int, stopped: Callable[[], bool]) -> array[floa
         now = time.time()
         found.append(now - behind)
         found.append(now)
+        began = time.perf_counter()
+        bytes_of_pages += 1
+        found.append(time.perf_counter() - began)
         # Stays on the grid: of a stall that follows at once, as little as possible is slept through.
         due += behind - behind % _TICK_S
         found.append(time.time())

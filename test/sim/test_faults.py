@@ -9,7 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rclpy.serialization import serialize_message
 
+from bags_helpers import TWIST, topic, twist
+from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.ros import messages as m
 from iwm_sim import fault_relay as relay
 from iwm_sim import faults, soak
@@ -131,6 +134,30 @@ class TestSoak:
         assert asked == [(5.02, 5.04), (6.49, 6.51)]
         assert first == pytest.approx((0.04, 0.02, 0.006)) and not first.own
         assert second == pytest.approx((1.51, 0.02, 0.004)) and second.own
+
+    def test_a_command_counts_as_lost_from_the_first_input_on(self, tmp_path: Path) -> None:
+        topics = (m.POWER_MANAGER_STATE, m.WHEEL_TORQUE_COMMAND, m.FRICTION_BRAKE_COMMAND)
+        with BagWriter(tmp_path / "bag") as writer:
+            numbers = {name: writer.add_topic(topic(f"/{name}", "sensor_msgs/msg/JointState")) for name in topics}
+            speed = writer.add_topic(topic("/vehicle_speed", TWIST))
+            for step in range(1, 7):
+                stamp_ns = step * 10_000_000
+                if step >= 3:
+                    writer.write(speed, stamp_ns, twist(stamp_ns, 1.0), stamp_ns, step)
+                torque = m.torque_command_message(stamp_ns, m.WHEEL_NAMES, (0.0,) * 4)
+                state = m.named_numbers_message(stamp_ns, ("step", "mode"), (float(step), 1.0))
+                for name in topics:
+                    # The recorder met the publisher of this one last; and one was lost.
+                    if name != m.WHEEL_TORQUE_COMMAND or step not in (1, 5):
+                        content = serialize_message(state if name == m.POWER_MANAGER_STATE else torque)
+                        writer.write(numbers[name], stamp_ns + 1000, content, stamp_ns + 1000, step)
+        recorded = soak.read_bag(tmp_path / "bag")
+        assert (recorded.skipped, recorded.uncommanded, recorded.degraded) == (0, 1, 0)
+        assert len(recorded.step_ns) == 6
+        assert recorded.counts == {m.POWER_MANAGER_STATE: 6, m.WHEEL_TORQUE_COMMAND: 4} | {
+            m.FRICTION_BRAKE_COMMAND: 6,
+            m.VEHICLE_SPEED: 4,
+        }
 
     def test_a_processor_is_left_to_others_unless_it_is_the_only_one(self) -> None:
         allowed = os.sched_getaffinity(0)

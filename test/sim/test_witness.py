@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from iwm_sim import soak
 from iwm_sim.witness import Look, Stall, Witness, _overlap_s
 
 #: Wants the processor it is given all the time.
@@ -77,14 +78,32 @@ def test_what_was_withheld_counts_although_the_kernel_booked_it_as_used() -> Non
     assert witness.machine_s(1.4, 1.6) == 0.0  # it slept
 
 
+def test_slow_work_is_told_and_not_deducted() -> None:
+    witness = witness_of([])
+    seconds = np.arange(100.0)
+    witness.withheld[0] = np.column_stack([seconds, seconds + 0.1])
+    witness.work_s[0] = np.where(seconds == 50.0, 240e-6, 10e-6)
+    witness.looks = [Look(time_s, time_s, 0, 1) for time_s in seconds]
+    assert witness.slowest_work_s(45.0, 55.0) == pytest.approx((240e-6, 10e-6))
+    assert witness.slowest_work_s(51.0, 55.0) == pytest.approx((10e-6, 10e-6))
+    assert witness.slowest_work_s(200.0, 201.0) == (0.0, 0.0)
+    assert witness.machine_s(45.0, 55.0) == pytest.approx(1.0)
+    late = soak.LateStep(10.0, 2.0, 0.0)
+    assert "240 us (10 us usually)" in soak.slow_memory(witness, late, 40.5)
+    assert soak.slow_memory(witness, late, 60.0) == ""
+
+
 def test_a_stall_counts_only_if_it_woke_in_it() -> None:
-    stalls = [Stall(1.05, 1.15), Stall(1.21, 1.55), Stall(1.61, 1.64)]
-    witness = witness_of(stalls)
+    stalls = (Stall(1.05, 1.15), Stall(1.21, 1.55), Stall(1.61, 1.64))
+    witness = witness_of([*stalls])
     asleep = [Look(1.0 + 0.1 * i, 7.0, 3, 0) for i in range(6)]
     witness.looks = [*asleep, Look(1.6, 7.01, 3, 1), Look(1.7, 7.11, 3, 1)]
     assert witness.machine_s(1.0, 1.7) == pytest.approx(0.34)  # the first was over while it slept, the last is booked
     assert witness.machine_s(1.3, 1.7) == pytest.approx(0.25)
     assert witness.machine_s(1.0, 1.5) == 0.0
+    witness.stalls[0][1] = Stall(1.21, 1.4998)  # over for so short a time that it had yet to be woken
+    assert witness.machine_s(1.0, 1.7) == pytest.approx(0.2898)
+    witness.stalls[0][1] = stalls[1]
     witness.looks[6] = Look(1.6, 7.01, 4, 0)  # it woke and slept again
     assert witness.machine_s(1.0, 1.6) == pytest.approx(0.34)
     witness.looks = asleep
