@@ -52,7 +52,7 @@ class _Time(ctypes.Structure):
 
 
 @contextmanager
-def bounded(code: int, limit_s: float = LIMIT_S) -> Iterator[None]:
+def bounded(code: int, limit_s: float | None = None) -> Iterator[None]:
     """Leave DDS, after what the body of the `with` does; end the process if both take longer than allowed.
 
     Real-time priority is given up, and all threads get the same processor for that time: there, a thread that waits
@@ -61,12 +61,12 @@ def bounded(code: int, limit_s: float = LIMIT_S) -> Iterator[None]:
     Parameters
     ----------
     code : exit code of the process if it has to be ended; nothing is printed, no destructor runs then
-    limit_s : longest time for the body, the shutdown of rclpy and the garbage in between
+    limit_s : longest time for the body, the shutdown of rclpy and the garbage in between; None: `LIMIT_S`
     """
     sys.stdout.flush()
     sys.stderr.flush()
     realtime.give_up_priority()
-    with _deadline(code, limit_s), one_processor():
+    with _deadline(code, LIMIT_S if limit_s is None else limit_s), one_processor():
         try:
             yield
         finally:
