@@ -1,4 +1,4 @@
-"""Learn a policy from recorded driving, and keep it only if it costs no more: `learn_policy --help`.
+"""Learn a policy from recorded driving, and keep it only if it is no worse: `learn_policy --help`.
 
 Ten minutes of driving do not fill a transition matrix, and the driver's demand is no Markov chain. So how much a
 recording should count beside standard cycles, and how dear a move should be to a solver that does not know the
