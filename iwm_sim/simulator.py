@@ -410,7 +410,7 @@ def main(args: Sequence[str] | None = None) -> int:
     interruption = Interruption()
     interruption.install()
     node: Simulator | None = None
-    code = 0
+    code = 1
     try:
         check_parameter_files(sys.argv if args is None else list(args))
         check_arguments("simulator", "A driver and a car on a drive cycle, seen through topics.", PARAMETERS, args)
@@ -426,11 +426,11 @@ def main(args: Sequence[str] | None = None) -> int:
         if node.done.done():
             node.done.result()
         executor.shutdown()
+        code = 0
     except KeyboardInterrupt:
-        pass
+        code = 0
     except (IwmError, RuntimeError) as error:  # RuntimeError: rcl's only word for a wrong --ros-args
         print(f"simulator: {' '.join(str(error).split())}", file=sys.stderr)
-        code = 1
     finally:
         with ending.bounded(code):
             if node is not None:

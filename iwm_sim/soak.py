@@ -37,8 +37,6 @@ from iwm_sim.witness import Witness
 _RATE_HZ = 100.0
 _PERIOD_S = 1.0 / _RATE_HZ
 _SAMPLE_S = 5.0
-#: In Fast DDS's shared memory, whoever publishes may wait for a lock of a process that has just lost its processor.
-_NO_SHARED_MEMORY = ["env", "FASTDDS_BUILTIN_TRANSPORTS=UDPv4"]
 #: Memory is compared from here on: until then caches fill.
 _SETTLED = 0.2
 #: A step is late when it comes this many periods after the previous one.
@@ -188,9 +186,9 @@ def kept_off(processor: int | None) -> Iterator[None]:
 def drive(minutes: float, priority: int, processor: int | None, folder: Path) -> Driven:
     """Drive for some minutes.
 
-    With a real-time priority the power manager runs as docs/safety.md asks of a car: its memory is locked, and none of
-    it is shared with the others (`_NO_SHARED_MEMORY`). On the processor it is given, if any, nothing else of the soak
-    runs but the witness, which then watches that one only.
+    With a real-time priority the power manager's memory is locked, too. On the processor it is given, if any, nothing
+    else of the soak runs but the witness, which then watches that one only. It shares memory with the others, as nodes
+    with `ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST` always do.
     """
     cycle = folder / "soak.csv"
     # Up and down between 5 and 15 m/s: drive and brake all the time.
@@ -204,8 +202,7 @@ def drive(minutes: float, priority: int, processor: int | None, folder: Path) ->
         recorder = children.start("recorder", node_command("recorder", {"output": str(bag)}))
         manager = children.start(
             "power manager",
-            (_NO_SHARED_MEMORY if priority > 0 else [])
-            + node_command(
+            node_command(
                 "power_manager",
                 {
                     "strategy": "equal",

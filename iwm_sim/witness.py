@@ -40,7 +40,7 @@ _LOOK_S = 0.001
 _PRIORITY = 60
 _WAKE_UP_COLUMNS = 4
 #: Written to at each wake-up, a byte of each page: memory can be slow when the processor is not.
-_PAGE, _PAGES = 4096, 64
+_PAGE_BYTES, _PAGES = 4096, 64
 _REAL_TIME, _NORMAL = b"real-time\n", b"normal\n"
 
 
@@ -129,10 +129,10 @@ class Witness:
         """Time between two wall-clock times that the machine took, s.
 
         As long as it wanted to run: what it was not given, or what was withheld from everything on its processor,
-        whichever is longer, since either may be a part of the other. Where
-        it woke: the stall it woke in, as far as it slept through it. Where it slept all the time: nothing. Where nobody
-        looked: the stalls. Of a process that moves between processors it is the longest of what each says: it is on one
-        at a time, and stalls of two would explain too much when added up.
+        whichever is longer, since either may be a part of the other. Where it woke: the stall it woke in, as far as it
+        slept through it. Where it slept all the time: nothing. Where nobody looked: the stalls. Of a process that moves
+        between processors it is the longest of what each says: it is on one at a time, and stalls of two would explain
+        too much when added up.
         """
         return max((self._taken_s(processor, begin_s, end_s) for processor in self.stalls), default=0.0)
 
@@ -207,7 +207,7 @@ def _overlap_s(spans: NDArray[np.float64], begin_s: float, end_s: float) -> floa
 def _watch_processor(_processor: int, stopped: Callable[[], bool]) -> array[float]:
     """When each wake-up was due, when it came, how long its work took, when it was over; one after the other."""
     found = array("d")
-    bytes_of_pages = np.zeros(_PAGES * _PAGE, dtype=np.uint8)[::_PAGE]
+    bytes_of_pages = np.zeros(_PAGES * _PAGE_BYTES, dtype=np.uint8)[::_PAGE_BYTES]
     due = time.monotonic()
     while not stopped():
         due += _TICK_S

@@ -408,7 +408,7 @@ def _run_node(arguments: list[str]) -> int:
         node = Recorder()
         _record(node, interruption)
         code = 0
-    except IwmError as error:
+    except IwmError as error:  # not left to the caller: as long as it is on its way, it keeps the node
         print(f"recorder: {error}", file=sys.stderr)
     finally:
         with ending.bounded(code):

@@ -19,7 +19,7 @@ import rclpy
 
 from iwm_power_manager.ros import realtime
 
-#: Leaving takes some 50 ms; on a machine with far too much to do, a second or two.
+#: Leaving takes less than 0.1 s on an idle machine; on one with far too much to do, a second or two.
 LIMIT_S = 5.0
 
 _CLOCK_MONOTONIC, _SIGEV_THREAD = 1, 2

@@ -103,6 +103,20 @@ def test_leaving_is_not_done_at_a_priority_over_others(monkeypatch) -> None:
     assert len(asked) == len(os.listdir("/proc/self/task"))
 
 
+PRIORITY = """
+import os
+from iwm_power_manager.ros import ending
+asked = []
+os.sched_setscheduler = lambda thread, policy, _: asked.append(policy)
+with ending.bounded(9):
+    print(asked != [] and set(asked) == {os.SCHED_OTHER}, len(os.sched_getaffinity(0)))
+"""
+
+
+def test_priority_is_given_up_and_processors_shared_before_dds_is_left() -> None:
+    assert run(PRIORITY).stdout == "True 1\n"
+
+
 @pytest.mark.parametrize(
     ("module", "parameters", "code"),
     [

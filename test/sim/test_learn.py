@@ -78,6 +78,11 @@ class TestRecordedCycle:
             recorded_cycle("drive", RecordedDrive(time_s, time_s, time_s, 0, ()))
 
 
+def test_no_two_candidates_share_a_file() -> None:
+    candidates = [(0.2, 1.0), (0.2000001, 1.0), (0.2, 1.0000001), (RECORDING_ALONE, 1.0)]
+    assert len({learn.policy_path("folder", *candidate) for candidate in candidates}) == len(candidates)
+
+
 def test_weights_are_those_of_the_recording() -> None:
     recorded = Source("bag", "", 1.0, (np.zeros(3),))
     general = Source("cycle", "", 1.0, (np.zeros(3),))
