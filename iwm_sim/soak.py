@@ -28,6 +28,7 @@ from iwm_power_manager import files
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.ros import messages as m
+from iwm_power_manager.share import share_path
 from iwm_sim.demo import environment, node_command
 from iwm_sim.domains import claimed_domain
 from iwm_sim.drive import load_run
@@ -37,6 +38,9 @@ from iwm_sim.witness import Witness
 _RATE_HZ = 100.0
 _PERIOD_S = 1.0 / _RATE_HZ
 _SAMPLE_S = 5.0
+_PROFILE = "config/dds/without_shared_memory.xml"
+#: How Fast DDS begins the names of memory that processes share.
+_SHARED = "/fastrtps_"
 #: Memory is compared from here on: until then caches fill.
 _SETTLED = 0.2
 #: A step is late when it comes this many periods after the previous one.
@@ -113,6 +117,7 @@ class Driven(NamedTuple):
     recorded : what the bag holds
     published : messages by topic, as the simulator counted them
     ends : what was wrong with how power manager and recorder ended
+    shared : the power manager had memory in common with other processes through DDS
     """
 
     memory_kb: dict[str, list[int]]
@@ -120,6 +125,7 @@ class Driven(NamedTuple):
     recorded: Recorded
     published: Mapping[str, int]
     ends: list[str]
+    shared: bool
 
 
 class LateStep(NamedTuple):
@@ -155,6 +161,28 @@ def resident_kb(child: Child) -> int:
     return next((int(line.split()[1]) for line in lines if line.startswith("VmRSS:")), 0)
 
 
+def shares_memory(pid: int) -> bool:
+    """Whether Fast DDS shares memory between a process and others; False once it has ended."""
+    try:
+        return _SHARED in Path(f"/proc/{pid}/maps").read_text()
+    except OSError:
+        return False
+
+
+def without_shared_memory(environment: Mapping[str, str]) -> dict[str, str]:
+    """Give an environment in which nodes on this computer talk over UDP only.
+
+    With the discovery range LOCALHOST rmw would bring its own transports, shared memory among them.
+    """
+    profile = str(share_path(_PROFILE))
+    return {
+        **environment,
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
+        "FASTRTPS_DEFAULT_PROFILES_FILE": profile,
+        "FASTDDS_DEFAULT_PROFILES_FILE": profile,
+    }
+
+
 def growth_percent(samples_kb: Sequence[int]) -> float:
     """Growth from the median of the first settled fifth to that of the last, %."""
     settled = samples_kb[int(len(samples_kb) * _SETTLED) :]
@@ -187,8 +215,8 @@ def drive(minutes: float, priority: int, processor: int | None, folder: Path) ->
     """Drive for some minutes.
 
     With a real-time priority the power manager's memory is locked, too. On the processor it is given, if any, nothing
-    else of the soak runs but the witness, which then watches that one only. It shares memory with the others, as nodes
-    with `ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST` always do.
+    else of the soak runs but the witness, which then watches that one only. The nodes share no memory, so that none
+    waits for a lock that another one holds.
     """
     cycle = folder / "soak.csv"
     # Up and down between 5 and 15 m/s: drive and brake all the time.
@@ -197,7 +225,12 @@ def drive(minutes: float, priority: int, processor: int | None, folder: Path) ->
     files.atomic_write(cycle, ("time_s,speed_mps\n0.0,0.0\n" + "\n".join(rows) + "\n").encode())
     memory: dict[str, list[int]] = {}
     ends = []
-    with kept_off(processor), claimed_domain() as domain, Children(environment(folder, domain), folder) as children:
+    shared = False
+    with (
+        kept_off(processor),
+        claimed_domain() as domain,
+        Children(without_shared_memory(environment(folder, domain)), folder) as children,
+    ):
         bag, result = folder / "bag", folder / "drive.npz"
         recorder = children.start("recorder", node_command("recorder", {"output": str(bag)}))
         manager = children.start(
@@ -234,6 +267,7 @@ def drive(minutes: float, priority: int, processor: int | None, folder: Path) ->
                 for name, child in watched.items():
                     if resident := resident_kb(child):
                         memory.setdefault(name, []).append(resident)
+                shared |= shares_memory(manager.process.pid)
                 for child in (recorder, manager):
                     child.check_running()
                 time.sleep(_SAMPLE_S)
@@ -244,7 +278,7 @@ def drive(minutes: float, priority: int, processor: int | None, folder: Path) ->
                 except ChildError as error:  # half an hour is not thrown away for that
                     ends.append(str(error))
     notes = load_run(result)[1]
-    return Driven(memory, witness, read_bag(bag), notes["published"], ends)
+    return Driven(memory, witness, read_bag(bag), notes["published"], ends, shared)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -275,8 +309,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except IwmError as error:
         print(f"soak: {error}", file=sys.stderr)
         return 1
-    memory, witness, recorded, published, ends = driven
+    memory, witness, recorded, published, ends, shared = driven
     problems = [*ends]
+    if shared:
+        problems.append("the power manager shared memory with other processes")
     growth = {name: growth_percent(samples) for name, samples in memory.items()}
     for name, percent in growth.items():
         print(f"memory of the {name:14} {memory[name][-1] / 1024:7.1f} MB, growth {percent:+.1f} %")

@@ -31,6 +31,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from iwm_power_manager.errors import IwmError
+from iwm_sim import wake_ups
+
 _TICK_S = 0.0005
 #: Later than this is no ordinary wake-up: on an idle machine one of a thousand takes so long.
 _LATE_S = 0.00025
@@ -38,9 +41,11 @@ _LATE_S = 0.00025
 _LOOK_S = 0.001
 #: Above every other thread that asks for real time here; normal priority where that is refused.
 _PRIORITY = 60
-_WAKE_UP_COLUMNS = 4
 #: Written to at each wake-up, a byte of each page: memory can be slow when the processor is not.
-_PAGE_BYTES, _PAGES = 4096, 64
+_PAGE_BYTES, _PAGES = 4096, 16
+#: Wake-ups are put away this often; there is room for half a minute of them.
+_PUT_AWAY_S = 1.0
+_RING_ROWS = 1 << 16
 _REAL_TIME, _NORMAL = b"real-time\n", b"normal\n"
 
 
@@ -109,21 +114,16 @@ class Witness:
 
     def __exit__(self, *_: object) -> None:
         """End watching; what was seen stays."""
-        found = []
-        for process in self.processes:
-            numbers = array("d")
-            numbers.frombytes(process.communicate()[0])
-            found.append(numbers)
-        *by_processor, seen = found
+        *by_processor, seen = (process.communicate()[0] for process in self.processes)
         for processor, numbers in zip(self._processors, by_processor, strict=True):
-            due_s, woke_s, work_s, slept_s = np.frombuffer(numbers).reshape(-1, _WAKE_UP_COLUMNS).T
+            rows_ns = np.frombuffer(numbers, dtype=np.int64).reshape(-1, wake_ups.COLUMNS)
+            due_s, woke_s, work_s, slept_s = rows_ns.T / 1e9
             late = woke_s - due_s > _LATE_S
             self.stalls[processor] = [Stall(*pair) for pair in zip(due_s[late], woke_s[late], strict=True)]
             seen_by_all = slice(None if self.real_time else 0)
             self.withheld[processor] = np.column_stack([due_s, slept_s])[seen_by_all]
             self.work_s[processor] = work_s[seen_by_all]
-        columns = (seen[column :: len(Look._fields)] for column in range(len(Look._fields)))
-        self.looks = [Look(*row) for row in zip(*columns, strict=True)]
+        self.looks = [Look(*row) for row in np.frombuffer(seen).reshape(-1, len(Look._fields)).tolist()]
 
     def machine_s(self, begin_s: float, end_s: float) -> float:
         """Time between two wall-clock times that the machine took, s.
@@ -204,25 +204,52 @@ def _overlap_s(spans: NDArray[np.float64], begin_s: float, end_s: float) -> floa
     return float(np.sum(np.maximum(np.minimum(near[:, 1], end_s) - np.maximum(near[:, 0], begin_s), 0.0)))
 
 
-def _watch_processor(_processor: int, stopped: Callable[[], bool]) -> array[float]:
-    """When each wake-up was due, when it came, how long its work took, when it was over; one after the other."""
-    found = array("d")
-    bytes_of_pages = np.zeros(_PAGES * _PAGE_BYTES, dtype=np.uint8)[::_PAGE_BYTES]
-    due = time.monotonic()
-    while not stopped():
-        due += _TICK_S
-        time.sleep(max(due - time.monotonic(), 0.0))
-        behind = time.monotonic() - due
-        now = time.time()
-        found.append(now - behind)
-        found.append(now)
-        began = time.perf_counter()
-        bytes_of_pages += 1
-        found.append(time.perf_counter() - began)
-        # Stays on the grid: of a stall that follows at once, as little as possible is slept through.
-        due += behind - behind % _TICK_S
-        found.append(time.time())
-    return found
+class _Watch:
+    """Wakes on the processor of the thread that runs it; another thread puts away what it wrote.
+
+    Parameters
+    ----------
+    rows : wake-ups kept until they are put away
+    """
+
+    def __init__(self, rows: int = _RING_ROWS) -> None:
+        # Written to once, so that no page has to be found while it watches.
+        self._ring = np.ones((rows, wake_ups.COLUMNS), dtype=np.int64)
+        self._state = np.zeros(2, dtype=np.int64)
+        self._pages = np.ones(_PAGES * _PAGE_BYTES, dtype=np.uint8)[::_PAGE_BYTES]
+        self._timespec = np.zeros(2, dtype=np.int64)
+        self._kept: list[NDArray[np.int64]] = []
+        self._put_away = 0
+        self.stop()
+        self.run()  # compiles
+        self._state[:] = 0
+
+    def run(self) -> None:
+        """Watch until `stop`."""
+        wake_ups.wake_up(self._ring, self._state, self._pages, self._timespec, round(_TICK_S * 1e9))
+
+    def stop(self) -> None:
+        """`run` returns at its next wake-up."""
+        self._state[wake_ups.STOP] = 1
+
+    def put_away(self) -> None:
+        """Take what has been written since the last call; to be called before the ring is full.
+
+        Raises
+        ------
+        IwmError
+            It was called too late: wake-ups are lost.
+        """
+        count = int(self._state[wake_ups.COUNT])
+        numbers = np.arange(self._put_away, count) % len(self._ring)
+        self._kept.append(self._ring[numbers])
+        if int(self._state[wake_ups.COUNT]) - self._put_away > len(self._ring):
+            raise IwmError("the witness's wake-ups were not put away in time")
+        self._put_away = count
+
+    def found(self) -> NDArray[np.int64]:
+        """Everything put away, shape (n, COLUMNS)."""
+        return np.concatenate(self._kept)
 
 
 def _watch_process(pid: int, stopped: Callable[[], bool]) -> array[float]:
@@ -244,24 +271,43 @@ def _main() -> None:
     """`python -m iwm_sim.witness processor|process NUMBER`: watch until the input ends, then write what was seen."""
     kind, number = sys.argv[1], int(sys.argv[2])
     gc.disable()
+    ended = threading.Event()
+    watch = _Watch() if kind == "processor" else None
+
+    def put_away() -> None:
+        while not ended.wait(_PUT_AWAY_S):
+            assert watch is not None
+            watch.put_away()
+
+    def await_end() -> None:
+        sys.stdin.buffer.read()
+        ended.set()
+        if watch is not None:
+            watch.stop()
+
+    # Before this thread asks for one processor and priority, which the others must not have.
+    threads = [threading.Thread(target=await_end, daemon=True)]
+    if watch is not None:
+        threads.append(threading.Thread(target=put_away, daemon=True))
+    for thread in threads:
+        thread.start()
     said = _REAL_TIME
-    if kind == "processor":
+    if watch is not None:
         os.sched_setaffinity(0, {number})
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_PRIORITY))
     except OSError:
         said = _NORMAL
-    ended = threading.Event()
-
-    def await_end() -> None:
-        sys.stdin.buffer.read()
-        ended.set()
-
-    threading.Thread(target=await_end, daemon=True).start()
     sys.stdout.buffer.write(said)
     sys.stdout.buffer.flush()
-    found = (_watch_processor if kind == "processor" else _watch_process)(number, ended.is_set)
-    sys.stdout.buffer.write(found.tobytes())
+    if watch is None:
+        found = _watch_process(number, ended.is_set).tobytes()
+    else:
+        watch.run()
+        threads[-1].join()
+        watch.put_away()
+        found = watch.found().tobytes()
+    sys.stdout.buffer.write(found)
 
 
 if __name__ == "__main__":

@@ -60,12 +60,14 @@ def arguments(parameters: Mapping[str, Any], remaps: Mapping[str, str] | None = 
 class Running:
     """A node in a process of its own."""
 
-    def __init__(self, module: str, args: list[str], domain: int, folder: Path) -> None:
+    def __init__(
+        self, module: str, args: list[str], domain: int, folder: Path, more: Mapping[str, str] | None = None
+    ) -> None:
         self.output = folder / f"{module.rsplit('.', 1)[-1]}-{time.monotonic_ns()}.log"
         with self.output.open("w") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", module, *args],
-                env=environment(domain, folder),
+                env=environment(domain, folder) | dict(more or {}),
                 stdout=log,
                 stderr=subprocess.STDOUT,
             )

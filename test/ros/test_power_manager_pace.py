@@ -1,0 +1,102 @@
+"""Control steps come when they are due, ahead of the executor, and never keep it from serving the rest."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+
+from iwm_power_manager.nodes.power_manager import PowerManager
+
+PERIOD_S = 0.01
+
+
+@pytest.fixture(scope="module")
+def ros(compiled_law):
+    parameters = ("autostart:=false", "strategy:=equal", "policy_file:=''", "rate_hz:=100.0")
+    remaps = ("__ns:=/pace", "/diagnostics:=/pace/diagnostics")
+    rclpy.init(
+        args=["--ros-args", *(x for p in parameters for x in ("-p", p)), *(x for r in remaps for x in ("-r", r))]
+    )
+    yield
+    rclpy.shutdown()
+
+
+@pytest.fixture
+def node(ros):
+    node = PowerManager()
+    yield node
+    node.stop()
+    node.destroy_node()
+
+
+@pytest.fixture
+def stamps(node, monkeypatch):
+    """When steps were taken, monotonic s."""
+    found: list[float] = []
+    take = node._take_step
+
+    def noting(*arguments) -> None:
+        found.append(time.monotonic())
+        take(*arguments)
+
+    monkeypatch.setattr(node, "_take_step", noting)
+    return found
+
+
+def test_without_steps_there_is_nothing_to_wait_for(node) -> None:
+    assert not node.step_when_due()
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    assert not node.step_when_due()
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    assert node.step_when_due()
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    assert not node.step_when_due()
+
+
+def test_it_waits_for_each_step_and_takes_it_once(node, stamps) -> None:
+    assert node.start()
+    began_s = time.monotonic()
+    for _ in range(20):
+        assert node.step_when_due()
+    lasted_s = time.monotonic() - began_s
+    assert len(stamps) == 20
+    assert lasted_s > 18.5 * PERIOD_S  # never before it is due; how late it is, is the machine's affair
+    # A call that came much too late is followed by the next due one, not by one for each that was missed.
+    time.sleep(5.5 * PERIOD_S)
+    for _ in range(3):
+        assert node.step_when_due()
+    assert stamps[-1] - stamps[-3] > PERIOD_S
+
+
+def test_any_executor_steps_it_too_and_not_a_second_time(node, stamps) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    assert node.start()
+    assert node.step_when_due()
+    taken = len(stamps)
+    due_s = stamps[-1] + 0.5 * PERIOD_S
+    executor.spin_once(timeout_sec=0.0)
+    assert len(stamps) == taken or time.monotonic() > due_s
+    deadline_s = time.monotonic() + 30.0
+    while len(stamps) < taken + 5:
+        assert time.monotonic() < deadline_s
+        executor.spin_once(timeout_sec=0.1)
+    executor.shutdown()
+
+
+def test_a_clock_set_back_does_not_stop_the_rest(node, monkeypatch) -> None:
+    assert node.start()
+    monkeypatch.setattr(node._step_timer, "time_until_next_call", lambda: 3_600_000_000_000)
+    assert not node.step_when_due()
+
+
+def test_on_simulated_time_the_executor_decides(node) -> None:
+    assert node.start()
+    assert node.set_parameters([Parameter("use_sim_time", value=True)])[0].successful
+    assert node.get_clock().ros_time_is_active
+    assert not node.step_when_due()
