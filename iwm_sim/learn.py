@@ -1,11 +1,12 @@
 """Learn a policy from recorded driving, and keep it only if it is no worse: `learn_policy --help`.
 
 Ten minutes of driving do not fill a transition matrix, and the driver's demand is no Markov chain. So how much a
-recording should count beside standard cycles, and how dear a move should be to a solver that does not know the
-driver's next one, cannot be told from the data alone; but it can be tried. Policies are solved with the recorded drive
-at several weights and prices, and each drives what was recorded in the closed loop. Of those that need no more energy
-than the policy of the cycles alone, the one that costs least of what the solver minimizes, energy and the true price of
-moving the split, is written; if that is no less than what the cycles' policy costs, theirs is. (Laroche et al. 2019,
+recording should count beside standard cycles, how far around its speed a step of it should, and how dear a move should
+be to a solver that does not know the driver's next one, cannot be told from the data alone; but it can be tried.
+Policies are solved with the recorded drive at several weights, bandwidths and prices, and each drives what was recorded
+in the closed loop. Of those that need no more energy than the policy of the cycles alone, the one that costs least of
+what the solver minimizes, energy and the true price of moving the split, is written; if that is no less than what the
+cycles' policy costs, theirs is. (Laroche et al. 2019,
 *Safe policy improvement with baseline bootstrapping*, fall back on a baseline where data are few; here, as a whole.)
 
 Exit codes: 0 done; 2 bad arguments or files; 130 interrupted.
@@ -50,7 +51,9 @@ DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 CYCLES_ALONE, RECORDING_ALONE = 0.0, math.inf
 WEIGHTS = (0.05, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0, RECORDING_ALONE)
 #: What a move costs the solver, of its true price. Only the true one is judged by.
-PRICES = (0.8, 0.9, 1.0, 1.1)
+PRICES = (0.8, 0.9, 0.97, 1.0, 1.1)
+#: Of the grid's bandwidth in speed, over which steps of the demand are taken together.
+BANDWIDTHS = (1.0, 1.3)
 CYCLES = ("ftp75", "hwfet", "nycc")
 #: A recorded speed is followed from second to second, like a standard cycle: noise is no wish of the driver's.
 _TRACE_STEP_S = 1.0
@@ -59,9 +62,10 @@ _DESCRIPTION = """\
 Learn a policy from recorded driving, and keep it only if it is no worse than one of standard cycles.
 
 Policies are solved from the recorded drives alone and beside the cycles, a recorded second counting as much as several
-seconds of a cycle, or as a part of one, and with moves of the split a little cheaper or dearer than they are. Each of
-them drives the recorded speed in simulation. Of those that need no more energy than the cycles' own policy, the one
-with the least cost is written: energy, and the true price of moving the split, which is what policies are solved for.
+seconds of a cycle, or as a part of one, with steps of the demand taken together over more or less speed, and with moves
+of the split a little cheaper or dearer than they are. Each of them drives the recorded speed in simulation. Of those
+that need no more energy than the cycles' own policy, the one with the least cost is written: energy, and the true price
+of moving the split, which is what policies are solved for.
 If none costs less than the cycles' policy, that one is written.
 """
 
@@ -81,21 +85,39 @@ exit codes: 0 done, 2 bad arguments or files, 130 interrupted
 """
 
 
-class Outcome(NamedTuple):
-    """What a policy cost on the drives, all of them together.
+class Candidate(NamedTuple):
+    """How a policy is solved.
 
     Attributes
     ----------
     weight : of a recorded second beside a second of a cycle
     price : of a move in the solver, as a multiple of the true one
+    bandwidth : in speed, as a multiple of the grid's
+    """
+
+    weight: float
+    price: float
+    bandwidth: float
+
+
+#: The policy that every other one is held against.
+BASELINE = Candidate(CYCLES_ALONE, 1.0, 1.0)
+_NOT_SOLVED = Candidate(math.nan, math.nan, math.nan)
+
+
+class Outcome(NamedTuple):
+    """What a policy cost on the drives, all of them together.
+
+    Attributes
+    ----------
+    candidate : how it was solved
     energy_wh_per_km : out of the cells
     moves_wh_per_km : true price of moving the split, in the same unit
     changes_per_min : changes of the split that count
     trace_held : on every drive
     """
 
-    weight: float
-    price: float
+    candidate: Candidate
     energy_wh_per_km: float
     moves_wh_per_km: float
     changes_per_min: float
@@ -108,7 +130,7 @@ class Outcome(NamedTuple):
 
 
 class Task(NamedTuple):
-    """All that is needed to solve and drive at one weight and price."""
+    """All that is needed to solve and drive a candidate."""
 
     problem: Problem
     vehicle: Vehicle
@@ -149,32 +171,35 @@ def sources_at(weight: float, recorded: Sequence[Source], general: Sequence[Sour
     return [dataclasses.replace(source, weight=weight) for source in recorded] + list(general)
 
 
-def priced(problem: Problem, price: float) -> Problem:
-    """The problem with moves at a multiple of their price."""
+def varied(problem: Problem, candidate: Candidate) -> Problem:
+    """The problem with moves at a multiple of their price, and a multiple of the bandwidth."""
+    price = candidate.price
     by_friction = tuple((friction, cost_j * price) for friction, cost_j in problem.switching_cost_by_friction)
     return dataclasses.replace(
-        problem, switching_cost_j=problem.switching_cost_j * price, switching_cost_by_friction=by_friction
+        problem,
+        switching_cost_j=problem.switching_cost_j * price,
+        switching_cost_by_friction=by_friction,
+        speed_bandwidth_mps=problem.speed_bandwidth_mps * candidate.bandwidth,
     )
 
 
-def policy_path(folder: str, weight: float, price: float) -> Path:
-    """Where the policy of a weight and a price is while it is tried; every pair has a file of its own."""
-    return Path(folder) / f"weight_{weight}_price_{price}.npz"
+def policy_path(folder: str, candidate: Candidate) -> Path:
+    """Where the policy of a candidate is while it is tried; every one has a file of its own."""
+    return Path(folder) / ("_".join(f"{name}_{value}" for name, value in candidate._asdict().items()) + ".npz")
 
 
-def try_candidate(candidate: tuple[float, float], task: Task) -> Outcome:
-    """Solve with the recording at a weight and moves at a price, and drive."""
-    weight, price = candidate
-    problem = priced(task.problem, price)
-    sources = sources_at(weight, task.recorded, task.general)
+def try_candidate(candidate: Candidate, task: Task) -> Outcome:
+    """Solve, and drive."""
+    problem = varied(task.problem, candidate)
+    sources = sources_at(candidate.weight, task.recorded, task.general)
     chain = chain_of(problem, sources)
-    path = policy_path(task.folder, weight, price)
+    path = policy_path(task.folder, candidate)
     solved = solve_one(problem, task.vehicle, task.friction, chain, sources, path)
     true_price_j = task.problem.on_road(task.friction).switching_cost_j
     return drive_all(candidate, "sdp_lookahead", solved.policy.table(), true_price_j, task)
 
 
-def drive_all(candidate: tuple[float, float], strategy: str, table: PolicyTable, price_j: float, task: Task) -> Outcome:
+def drive_all(candidate: Candidate, strategy: str, table: PolicyTable, price_j: float, task: Task) -> Outcome:
     """Drive every drive with a strategy."""
     energy_wh = moves_wh = distance_m = minutes = changes = 0.0
     held = True
@@ -191,7 +216,7 @@ def drive_all(candidate: tuple[float, float], strategy: str, table: PolicyTable,
     if distance_m <= 0.0:
         raise ConfigError(", ".join(cycle.source for cycle in task.drives), "", "the car does not move")
     per_km = 1000.0 / distance_m
-    return Outcome(*candidate, energy_wh * per_km, moves_wh * per_km, changes / minutes, held)
+    return Outcome(candidate, energy_wh * per_km, moves_wh * per_km, changes / minutes, held)
 
 
 def choose(outcomes: Sequence[Outcome]) -> Outcome:
@@ -199,9 +224,9 @@ def choose(outcomes: Sequence[Outcome]) -> Outcome:
 
     Parameters
     ----------
-    outcomes : one of them with the cycles alone
+    outcomes : one of them of `BASELINE`
     """
-    (safe,) = (outcome for outcome in outcomes if outcome.weight == CYCLES_ALONE)
+    (safe,) = (outcome for outcome in outcomes if outcome.candidate == BASELINE)
     # Energy that was saved by not following the trace is no saving.
     fair = [
         outcome
@@ -212,21 +237,30 @@ def choose(outcomes: Sequence[Outcome]) -> Outcome:
     return best if best.cost_wh_per_km < safe.cost_wh_per_km else safe
 
 
+def candidates_of(
+    problem: Problem, weights: Sequence[float], prices: Sequence[float], bandwidths: Sequence[float]
+) -> list[Candidate]:
+    """Give the baseline, and then every weight from the smallest to the greatest, with every price and bandwidth."""
+    if not problem.demand_by_speed:
+        bandwidths = (1.0,)
+    product = itertools.product(*(sorted(set(values)) for values in (weights, prices, bandwidths)))
+    return [BASELINE, *(candidate for values in product if (candidate := Candidate(*values)) != BASELINE)]
+
+
 def learn(
-    task: Task, weights: Sequence[float], prices: Sequence[float], jobs: int, quiet: bool
+    task: Task, candidates: Sequence[Candidate], jobs: int, quiet: bool
 ) -> tuple[Outcome, list[Outcome], Outcome, Policy]:
-    """Try weights and prices on one road.
+    """Try candidates, the baseline first, on one road.
 
     Returns
     -------
-    equal split; the cycles alone and then every weight from the smallest to the greatest, at every price; the chosen
-    one of these; its policy
+    equal split; what each candidate cost; the chosen one of these; its policy
     """
-    order = [(CYCLES_ALONE, 1.0), *itertools.product(sorted(set(weights)), sorted(set(prices)))]
+    order = list(candidates)
     with tqdm(
         total=len(order), desc=f"friction {task.friction:g}", unit="policy", file=sys.stderr, disable=quiet, leave=False
     ) as bar:
-        equal = drive_all((math.nan, math.nan), "equal", empty_table(), 0.0, task)
+        equal = drive_all(_NOT_SOLVED, "equal", empty_table(), 0.0, task)
         # The first one in this process: what it compiles, the others find in the cache.
         outcomes = [try_candidate(order[0], task)]
         bar.update()
@@ -236,7 +270,7 @@ def learn(
 
         outcomes += on_all_cores(partial(try_candidate, task=task), order[1:], jobs, done)
     chosen = choose(outcomes)
-    policy = load_policy(policy_path(task.folder, chosen.weight, chosen.price))
+    policy = load_policy(policy_path(task.folder, chosen.candidate))
     return equal, outcomes, chosen, policy
 
 
@@ -265,7 +299,8 @@ def parser() -> argparse.ArgumentParser:
         type=float,
         default=list(WEIGHTS),
         metavar="W",
-        help="a recorded second counts as W seconds of a cycle; inf: the bags alone "
+        help="a recorded second counts as W seconds of a cycle; inf: the bags alone, 0: the cycles alone, to see what "
+        "the other two do without a bag "
         f"(default: {' '.join(f'{weight:g}' for weight in WEIGHTS)})",
     )
     result.add_argument(
@@ -275,6 +310,15 @@ def parser() -> argparse.ArgumentParser:
         default=list(PRICES),
         metavar="P",
         help=f"a move costs the solver P times its price (default: {' '.join(f'{price:g}' for price in PRICES)})",
+    )
+    result.add_argument(
+        "--bandwidths",
+        nargs="+",
+        type=float,
+        default=list(BANDWIDTHS),
+        metavar="B",
+        help="a step of the demand counts for speeds around its own, B times as far as the grid's speed_bandwidth_mps "
+        f"(default: {' '.join(f'{bandwidth:g}' for bandwidth in BANDWIDTHS)})",
     )
     result.add_argument("--grid", default="coupled", metavar="NAME|FILE", help="grid (default: %(default)s)")
     result.add_argument("--idle-drive", choices=sorted(IDLE_DRIVES), help="replaces the car's idle_drive")
@@ -301,11 +345,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _learn(options: argparse.Namespace) -> None:
     for weight in options.weights:
-        if not weight > 0.0:
-            raise ConfigError("arguments", "--weights", f"{weight:g} is out of range", "above 0, inf included")
-    for price in options.prices:
-        if not 0.0 < price < math.inf:
-            raise ConfigError("arguments", "--prices", f"{price:g} is out of range", "above 0 and finite")
+        if not weight >= 0.0:
+            raise ConfigError("arguments", "--weights", f"{weight:g} is out of range", "0 or more, inf included")
+    for key, values in (("--prices", options.prices), ("--bandwidths", options.bandwidths)):
+        for value in values:
+            if not 0.0 < value < math.inf:
+                raise ConfigError("arguments", key, f"{value:g} is out of range", "above 0 and finite")
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
     problem = load_grid(options.grid)
     frictions = [check_number("arguments", "--friction", value, 0.01, 2.0) for value in options.friction]
@@ -318,13 +363,12 @@ def _learn(options: argparse.Namespace) -> None:
         if options.drive
         else [recorded_cycle(name, drive) for name, drive in recordings]
     )
+    candidates = candidates_of(problem, options.weights, options.prices, options.bandwidths)
     roads = []
     for friction, path in zip(frictions, paths, strict=True):
         with tempfile.TemporaryDirectory(prefix="iwm-learn-") as folder:
             task = Task(problem, vehicle, friction, recorded, general, drives, folder)
-            equal, outcomes, chosen, policy = learn(
-                task, options.weights, options.prices, max(options.jobs, 1), options.quiet
-            )
+            equal, outcomes, chosen, policy = learn(task, candidates, max(options.jobs, 1), options.quiet)
         save_policy(policy, path)
         if not options.quiet:
             print(_text(task, equal, outcomes, chosen, path))
@@ -333,8 +377,9 @@ def _learn(options: argparse.Namespace) -> None:
                 "friction": friction,
                 "policy": str(path),
                 "checksum": policy.checksum,
-                "chosen_weight": _named(chosen.weight),
-                "chosen_price": chosen.price,
+                "chosen_weight": _named(chosen.candidate.weight),
+                "chosen_price": chosen.candidate.price,
+                "chosen_bandwidth": chosen.candidate.bandwidth,
                 "equal": _row(equal),
                 "outcomes": [_row(outcome) for outcome in outcomes],
             }
@@ -352,8 +397,9 @@ def _named(number: float) -> float | str | None:
 
 
 def _row(outcome: Outcome) -> dict[str, float | str | bool | None]:
-    named = {"weight": _named(outcome.weight), "price": _named(outcome.price)}
-    return {**outcome._asdict(), **named, "cost_wh_per_km": outcome.cost_wh_per_km}
+    measured = {name: value for name, value in outcome._asdict().items() if name != "candidate"}
+    solved = {name: _named(value) for name, value in outcome.candidate._asdict().items()}
+    return {**solved, **measured, "cost_wh_per_km": outcome.cost_wh_per_km}
 
 
 def _text(task: Task, equal: Outcome, outcomes: Sequence[Outcome], chosen: Outcome, path: Path) -> str:
@@ -361,26 +407,27 @@ def _text(task: Task, equal: Outcome, outcomes: Sequence[Outcome], chosen: Outco
     lines = [
         f"friction {task.friction:g}, idle drive {task.vehicle.idle_drive}; driven: {drives}",
         f"equal split: {equal.energy_wh_per_km:.2f} Wh/km; saved by policies, %:",
-        "recorded second counts as   moves at   energy   with price of moves   changes/min   trace",
+        "recorded second counts as   moves at   bandwidth   energy   with price of moves   changes/min   trace",
     ]
     for outcome in _best_of_each_weight(outcomes):
         saved = 100.0 * (1.0 - outcome.energy_wh_per_km / equal.energy_wh_per_km)
         net = saved - 100.0 * outcome.moves_wh_per_km / equal.energy_wh_per_km
         lines.append(
-            f"{_weight_text(outcome.weight):<27} {outcome.price:8.2f}  {saved:7.3f}   {net:19.3f}   "
+            f"{_weight_text(outcome.candidate.weight):<27} {outcome.candidate.price:8.2f}   "
+            f"{outcome.candidate.bandwidth:9.2f}  {saved:7.3f}   {net:19.3f}   "
             f"{outcome.changes_per_min:11.1f}   "
             f"{'held' if outcome.trace_held else 'left'}{'   <- chosen' if outcome is chosen else ''}"
         )
-    if chosen.weight == CYCLES_ALONE:
+    if chosen.candidate.weight == CYCLES_ALONE:
         lines.append("the recorded drives teach nothing that the cycles do not; the policy is that of the cycles")
     return "\n".join([*lines, f"policy: {path}", ""])
 
 
 def _best_of_each_weight(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """Of each weight the price that does best by the rule of `choose`, or costs least where that leaves none."""
+    """The baseline, and of each weight what `choose` would take; where it would take none, what costs least."""
     safe, *others = outcomes
     best = [safe]
-    for _, group in itertools.groupby(others, key=lambda outcome: outcome.weight):
+    for _, group in itertools.groupby(others, key=lambda outcome: outcome.candidate.weight):
         tried = list(group)
         found = choose([safe, *tried])
         best.append(found if found is not safe else min(tried, key=lambda outcome: outcome.cost_wh_per_km))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -21,14 +22,14 @@ from iwm_power_manager.share import share_path
 from iwm_power_manager.tools import solve_policy
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import closed_loop, learn
-from iwm_sim.learn import CYCLES_ALONE, RECORDING_ALONE, Outcome, choose, recorded_cycle, sources_at
+from iwm_sim.learn import CYCLES_ALONE, RECORDING_ALONE, Candidate, Outcome, choose, recorded_cycle, sources_at
 from iwm_sim.metrics import measure
 
 CAR = "jalalmaab_2015"
 
 
 def outcome(weight: float, energy: float, moves: float = 0.0, held: bool = True) -> Outcome:
-    return Outcome(weight, 1.0, energy, moves, 5.0, held)
+    return Outcome(Candidate(weight, 1.0, 1.0), energy, moves, 5.0, held)
 
 
 class TestChoose:
@@ -79,8 +80,39 @@ class TestRecordedCycle:
 
 
 def test_no_two_candidates_share_a_file() -> None:
-    candidates = [(0.2, 1.0), (0.2000001, 1.0), (0.2, 1.0000001), (RECORDING_ALONE, 1.0)]
-    assert len({learn.policy_path("folder", *candidate) for candidate in candidates}) == len(candidates)
+    values = [
+        (0.2, 1.0, 1.0),
+        (0.2000001, 1.0, 1.0),
+        (0.2, 1.0000001, 1.0),
+        (0.2, 1.0, 1.3),
+        (RECORDING_ALONE, 1.0, 1.0),
+    ]
+    assert len({learn.policy_path("folder", Candidate(*each)) for each in values}) == len(values)
+
+
+def test_the_baseline_comes_first_and_once() -> None:
+    problem = load_problem(share_path("config/grids/coupled.yaml"))
+    found = learn.candidates_of(problem, (RECORDING_ALONE, 1.0, CYCLES_ALONE), (1.0, 0.9, 0.9), (1.3, 1.0))
+    assert found[0] == learn.BASELINE and len(found) == len(set(found)) == 3 * 2 * 2
+    assert [candidate.weight for candidate in found] == [0.0] * 4 + [1.0] * 4 + [RECORDING_ALONE] * 4
+    without_speed = dataclasses.replace(problem, demand_by_speed=False)
+    assert [each.bandwidth for each in learn.candidates_of(without_speed, (1.0,), (1.0,), (1.3, 2.0))] == [1.0, 1.0]
+
+
+def test_a_candidate_changes_price_and_bandwidth_and_nothing_else() -> None:
+    problem = load_problem(share_path("config/grids/coupled.yaml"))
+    varied = learn.varied(problem, Candidate(1.0, 0.5, 2.0))
+    assert varied.speed_bandwidth_mps == 2.0 * problem.speed_bandwidth_mps
+    for friction in (0.2, 0.5, 0.9, 0.7):
+        assert varied.on_road(friction).switching_cost_j == 0.5 * problem.on_road(friction).switching_cost_j
+    changed = {
+        field.name
+        for field in dataclasses.fields(problem)
+        if getattr(varied, field.name) is not getattr(problem, field.name)
+        and getattr(varied, field.name) != getattr(problem, field.name)
+    }
+    assert changed <= {"speed_bandwidth_mps", "switching_cost_j", "switching_cost_by_friction"}
+    assert varied.switching_cost_j == 0.5 * problem.switching_cost_j
 
 
 def test_weights_are_those_of_the_recording() -> None:
@@ -131,7 +163,7 @@ def learned_and_general(bag: Path, folder: Path, friction: float, idle_drive: st
 
 
 def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(nycc_bag: Path, tmp_path: Path) -> None:
-    tried = ["--weights", "1", "inf", "--prices", "0.9", "0.8"]
+    tried = ["--weights", "1", "inf", "--prices", "0.9", "0.8", "--bandwidths", "1"]
     learned, general = learned_and_general(nycc_bag, tmp_path, 0.2, "drag", tried)
     energy, cost = cost_of(learned, 0.2, "drag")
     general_energy, general_cost = cost_of(general, 0.2, "drag")
@@ -185,7 +217,8 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("arguments", "said"),
         [
-            (["--weights", "0"], "--weights"),
+            (["--weights", "-0.1"], "--weights"),
+            (["--bandwidths", "0"], "--bandwidths"),
             (["--weights", "nan"], "--weights"),
             (["--prices", "0"], "--prices"),
             (["--prices", "inf"], "--prices"),
