@@ -127,15 +127,20 @@ def test_weights_are_those_of_the_recording() -> None:
     assert weights(0.2) == [("bag", 0.2), ("cycle", 1.0)]
 
 
-@pytest.fixture(scope="module")
-def nycc_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """NYCC, driven with equal split."""
+def drive_nycc(folder: Path, friction: float, idle_drive: str) -> Path:
+    """A bag of the NYCC, driven with equal split."""
     cycle = load_cycle(share_path("config/cycles/nycc.csv"))
-    car = load_vehicle(share_path(f"config/vehicles/{CAR}.yaml"), "drag")
-    drive = closed_loop.run(cycle, car, default_settings("equal"), empty_table(), 0.9)
-    path = tmp_path_factory.mktemp("bags") / "nycc_drive"
+    car = load_vehicle(share_path(f"config/vehicles/{CAR}.yaml"), idle_drive)
+    drive = closed_loop.run(cycle, car, default_settings("equal"), empty_table(), friction)
+    path = folder / "nycc_drive"
     write_drive(path, drive["speed_mps"], drive["power_demand_w"])
     return path
+
+
+@pytest.fixture(scope="module")
+def nycc_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """NYCC on a dry road."""
+    return drive_nycc(tmp_path_factory.mktemp("bags"), 0.9, "drag")
 
 
 def cost_of(policy_file: Path, friction: float, idle_drive: str) -> tuple[float, float]:
@@ -189,12 +194,14 @@ def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(nyc
 @pytest.mark.nightly
 @pytest.mark.parametrize("friction", [0.9, 0.5, 0.2])
 @pytest.mark.parametrize("idle_drive", ["none", "drag"])
-def test_it_is_no_worse_on_any_road(nycc_bag: Path, tmp_path: Path, friction: float, idle_drive: str) -> None:
-    learned, general = learned_and_general(nycc_bag, tmp_path, friction, idle_drive, [])
-    for found, limit in zip(
-        cost_of(learned, friction, idle_drive), cost_of(general, friction, idle_drive), strict=True
-    ):
-        assert found <= limit
+def test_what_its_nycc_taught_is_better_on_any_road(tmp_path: Path, friction: float, idle_drive: str) -> None:
+    bag = drive_nycc(tmp_path, friction, idle_drive)
+    learned, general = learned_and_general(bag, tmp_path, friction, idle_drive, [])
+    energy, cost = cost_of(learned, friction, idle_drive)
+    general_energy, general_cost = cost_of(general, friction, idle_drive)
+    assert energy <= general_energy and cost < general_cost
+    (road,) = json.loads((tmp_path / "learn.json").read_text())["roads"]
+    assert road["chosen_weight"] != CYCLES_ALONE
 
 
 class TestCommand:
