@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.demand_log import DemandLog
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport
-from iwm_power_manager.ros import diagnostics, ending, messages, qos, realtime
+from iwm_power_manager.ros import diagnostics, ending, messages, qos, quick, realtime
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.interruption import Interruption
@@ -51,11 +52,19 @@ _INPUTS = (
     messages.POWER_DEMAND,
     messages.ROAD_FRICTION,
 )
-#: The stamped inputs of a lock-step set: their queue and how they are read.
+#: How they are read.
+_READERS: dict[str, Callable[[], quick.QuickReader[Any]]] = {
+    messages.VEHICLE_SPEED: quick.speed_reader,
+    messages.WHEEL_STATES: quick.wheel_reader,
+    messages.BATTERY_STATE: quick.battery_reader,
+    messages.POWER_DEMAND: quick.number_reader,
+    messages.ROAD_FRICTION: quick.number_reader,
+}
+#: The stamped inputs of a lock-step set, and their queue.
 _STAMPED = (
-    (SPEED, messages.VEHICLE_SPEED, messages.read_vehicle_speed),
-    (WHEELS, messages.WHEEL_STATES, messages.read_wheel_speeds),
-    (BATTERY, messages.BATTERY_STATE, messages.read_battery_state),
+    (SPEED, messages.VEHICLE_SPEED),
+    (WHEELS, messages.WHEEL_STATES),
+    (BATTERY, messages.BATTERY_STATE),
 )
 #: How often, and how far apart, the rest of a set is looked for once its demand is there; later the watchdog looks.
 _SET_PATIENCE = 20
@@ -256,7 +265,7 @@ class PowerManager(LifecycleNode):
         }
         for topic in _INPUTS:
             if topic != messages.POWER_DEMAND or not self._lockstep:
-                self._intake.subscribe(messages.TOPIC_TYPES[topic], topic, profile)
+                self._intake.subscribe(messages.TOPIC_TYPES[topic], topic, profile, _READERS[topic]())
         if self._lockstep:
             self._demand_subscription = self.create_subscription(
                 Float64,
@@ -310,22 +319,22 @@ class PowerManager(LifecycleNode):
         """Real time: judge the newest message of every topic."""
         assert self._controller is not None
         monitor, intake, now_ns = self._controller.monitor, self._intake, self._now_ns()
-        for message, _ in intake.take(messages.VEHICLE_SPEED):
-            monitor.take_speed(messages.read_vehicle_speed(message), now_ns)
-        for message, _ in intake.take(messages.WHEEL_STATES):
-            monitor.take_wheels(messages.read_wheel_speeds(message), now_ns)
-        for message, _ in intake.take(messages.BATTERY_STATE):
-            monitor.take_battery(messages.read_battery_state(message), now_ns)
-        for message, info in intake.take(messages.POWER_DEMAND):
+        for reading, _ in intake.take(messages.VEHICLE_SPEED):
+            monitor.take_speed(reading, now_ns)
+        for reading, _ in intake.take(messages.WHEEL_STATES):
+            monitor.take_wheels(reading, now_ns)
+        for reading, _ in intake.take(messages.BATTERY_STATE):
+            monitor.take_battery(reading, now_ns)
+        for demand_w, info in intake.take(messages.POWER_DEMAND):
             # No stamp of its own: how long ago DDS sent it is all there is to tell a late one by.
             delay_s = (time.time_ns() - info["source_timestamp"]) / _NS_PER_S
-            monitor.take_demand(messages.read_number(message), delay_s, now_ns)
+            monitor.take_demand(demand_w, delay_s, now_ns)
         self._take_friction(now_ns)
 
     def _take_friction(self, now_ns: int) -> None:
         assert self._controller is not None
-        for message, _ in self._intake.take(messages.ROAD_FRICTION):
-            self._controller.monitor.take_friction(messages.read_number(message), now_ns)
+        for friction, _ in self._intake.take(messages.ROAD_FRICTION):
+            self._controller.monitor.take_friction(friction, now_ns)
 
     def _on_demand(self, message: Float64, info: dict[str, Any]) -> None:
         """Lock-step: the demand closes a set."""
@@ -339,9 +348,8 @@ class PowerManager(LifecycleNode):
                 time.sleep(_SET_POLL_S)
 
     def _collect_sets(self) -> None:
-        for queue, topic, read in _STAMPED:
-            for message, info in self._intake.take(topic):
-                reading = read(message)
+        for queue, topic in _STAMPED:
+            for reading, info in self._intake.take(topic):
                 self._queue.push(queue, reading.stamp_ns, info["source_timestamp"], reading)
         self._step_complete_sets()
 
