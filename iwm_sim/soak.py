@@ -200,6 +200,18 @@ def slow_memory(witness: Witness, step: LateStep, first_s: float) -> str:
     return f"; the witness's own work took up to {1e6 * longest_s:.0f} us ({1e6 * usual_s:.0f} us usually)"
 
 
+def cost_by_minute_s(step_ns: Sequence[int], witness: Witness) -> list[float]:
+    """Processor time that a step took on average, minute by minute: the same work, so what varies is the machine."""
+    if len(step_ns) < 2 or len(witness.looks) < 2:
+        return []
+    looks = np.array([(look.time_s, look.used_s) for look in witness.looks])
+    steps_s = np.array(step_ns) / 1e9
+    edges_s = np.arange(max(steps_s[0], looks[0, 0]), min(steps_s[-1], looks[-1, 0]), 60.0)
+    used_s = np.diff(np.interp(edges_s, looks[:, 0], looks[:, 1]))
+    steps = np.histogram(steps_s, edges_s)[0] if edges_s.size > 1 else np.empty(0)
+    return [float(used / count) for used, count in zip(used_s, steps, strict=True) if count]
+
+
 @contextmanager
 def kept_off(processor: int | None) -> Iterator[None]:
     """The calling thread, and the processes it starts, leave a processor to others, unless it is the only one."""
@@ -328,6 +340,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"the machine took {1000 * step.machine_s:.1f} ms" + slow_memory(witness, step, recorded.step_ns[0] / 1e9)
         )
     print(witness.summary())
+    if costs_s := cost_by_minute_s(recorded.step_ns, witness):
+        least, most = 1000 * min(costs_s), 1000 * max(costs_s)
+        print(f"a step took {least:.2f} to {most:.2f} ms of processor time, averaged over a minute")
     print(f"{recorded.degraded} steps in another mode than normal while there were inputs")
     if own:
         problems.append(f"{len(own)} late steps that the machine does not explain")

@@ -17,6 +17,7 @@ from iwm_power_manager.ros import messages as m
 from iwm_sim import fault_relay as relay
 from iwm_sim import faults, soak
 from iwm_sim.demo import node_command
+from iwm_sim.witness import Look, Witness
 
 WHEELS = m.wheel_states_message(5, m.WHEEL_NAMES, (1.0, 2.0, 3.0, 4.0), (5.0, 6.0, 7.0, 8.0))
 
@@ -134,6 +135,18 @@ class TestSoak:
         assert asked == [(5.02, 5.04), (6.49, 6.51)]
         assert first == pytest.approx((0.04, 0.02, 0.006)) and not first.own
         assert second == pytest.approx((1.51, 0.02, 0.004)) and second.own
+
+    def test_what_a_step_cost_minute_by_minute(self) -> None:
+        step_ns = [i * 500_000_000 for i in range(361)]
+        witness = Witness(0)
+        witness.looks = [
+            Look(time_s, 0.1 * min(time_s, 60.0) + 0.4 * max(time_s - 60.0, 0.0), 0, 1) for time_s in range(181)
+        ]
+        assert soak.cost_by_minute_s(step_ns, witness) == pytest.approx([0.05, 0.2], rel=0.02)
+        assert soak.cost_by_minute_s(step_ns[:50], witness) == []
+        assert soak.cost_by_minute_s([], witness) == []
+        witness.looks = []
+        assert soak.cost_by_minute_s(step_ns, witness) == []
 
     def test_a_command_counts_as_lost_from_the_first_input_on(self, tmp_path: Path) -> None:
         topics = (m.POWER_MANAGER_STATE, m.WHEEL_TORQUE_COMMAND, m.FRICTION_BRAKE_COMMAND)
