@@ -4,7 +4,7 @@ rclpy builds each message as an object, field by field, which for the four input
 messages of a topic are alike: same frame, same names, same lengths, other numbers. So a message is decoded in full
 once; of the next ones the bytes that stand for its build are compared, and only stamp and numbers are read. Where
 anything differs, the full way is taken again. What cannot be decoded at all becomes a reading that the checks of
-`control.inputs` refuse and count, like any other bad message.
+`control.inputs` refuse and count, like any other bad message. (`bags.joint_state` does the like for bags, without ROS.)
 """
 
 from __future__ import annotations

@@ -78,3 +78,25 @@ def start_pair(tmp_path_factory: pytest.TempPathFactory, compiled_law: None) -> 
     yield start
     for pair in pairs:
         pair.close()
+
+
+@pytest.fixture(scope="module")
+def ros(compiled_law: None) -> Iterator[None]:
+    """ROS in this process, for a power manager that nobody else on the domain hears."""
+    import rclpy
+
+    parameters = {**EQUAL, "autostart": False}
+    rclpy.init(args=arguments(parameters, {"__ns": "/here", "/diagnostics": "/here/diagnostics"}))
+    yield
+    rclpy.shutdown()
+
+
+@pytest.fixture
+def node(ros: None) -> Iterator[Any]:
+    """A power manager in this process, unconfigured; whoever asks for it serves it."""
+    from iwm_power_manager.nodes.power_manager import PowerManager
+
+    node = PowerManager()
+    yield node
+    node.stop()
+    node.destroy_node()

@@ -5,32 +5,12 @@ from __future__ import annotations
 import time
 
 import pytest
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
 from iwm_power_manager.control.controller import ControlFaultError
-from iwm_power_manager.nodes.power_manager import PowerManager
 from iwm_power_manager.ros import messages, qos
-
-
-@pytest.fixture(scope="module")
-def ros(compiled_law):
-    parameters = ("autostart:=false", "strategy:=equal", "policy_file:=''")
-    remaps = ("__ns:=/errors", "/diagnostics:=/errors/diagnostics")
-    args = ["--ros-args", *(part for p in parameters for part in ("-p", p)), *(x for r in remaps for x in ("-r", r))]
-    rclpy.init(args=args)
-    yield
-    rclpy.shutdown()
-
-
-@pytest.fixture
-def node(ros):
-    node = PowerManager()
-    yield node
-    node.stop()
-    node.destroy_node()
 
 
 @pytest.fixture

@@ -5,33 +5,15 @@ from __future__ import annotations
 import time
 
 import pytest
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
-from iwm_power_manager.nodes.power_manager import PowerManager
+from iwm_power_manager.nodes.power_manager import _spin
+from iwm_power_manager.ros.interruption import Interruption
 
+#: Of the node's default rate.
 PERIOD_S = 0.01
-
-
-@pytest.fixture(scope="module")
-def ros(compiled_law):
-    parameters = ("autostart:=false", "strategy:=equal", "policy_file:=''", "rate_hz:=100.0")
-    remaps = ("__ns:=/pace", "/diagnostics:=/pace/diagnostics")
-    rclpy.init(
-        args=["--ros-args", *(x for p in parameters for x in ("-p", p)), *(x for r in remaps for x in ("-r", r))]
-    )
-    yield
-    rclpy.shutdown()
-
-
-@pytest.fixture
-def node(ros):
-    node = PowerManager()
-    yield node
-    node.stop()
-    node.destroy_node()
 
 
 @pytest.fixture
@@ -87,6 +69,28 @@ def test_any_executor_steps_it_too_and_not_a_second_time(node, stamps) -> None:
         assert time.monotonic() < deadline_s
         executor.spin_once(timeout_sec=0.1)
     executor.shutdown()
+
+
+def test_the_nodes_own_loop_takes_its_steps_like_that_and_serves_the_rest(node, stamps, monkeypatch) -> None:
+    assert node.start()
+    interruption, waited, served = Interruption(started=True), [], []
+    step_when_due = node.step_when_due
+
+    def noting() -> bool:
+        waited.append(len(stamps))
+        interruption.requested = len(stamps) >= 20 and bool(served)
+        return step_when_due()
+
+    monkeypatch.setattr(node, "step_when_due", noting)
+
+    def serve() -> None:
+        served.append(len(stamps))
+        interruption.requested |= len(served) > 400  # nobody asked for a step
+
+    node.create_timer(0.5 * PERIOD_S, serve)
+    _spin(node, interruption)
+    assert len(waited) >= 20 and served
+    assert node._lifecycle_state() == "inactive"
 
 
 def test_a_clock_set_back_does_not_stop_the_rest(node, monkeypatch) -> None:
