@@ -36,19 +36,19 @@ bench: setup-dev  ## Time control path, bags and closed loop on this machine, ea
 ##@ Safety
 .PHONY: faults soak nightly coverage mutation
 faults: setup-run  ## Fault campaign over DDS with the simulator in the loop
-	@$(BIN)/python -m iwm_sim.faults $(ARGS)
+	@$(BIN)/python -m iwm_sim.campaigns.faults $(ARGS)
 
 soak: setup-dev  ## 30 minutes in real time at 100 Hz: memory, deadlines, counts
-	@$(BIN)/python -m iwm_sim.soak $(ARGS)
+	@$(BIN)/python -m iwm_sim.campaigns.soak $(ARGS)
 
 nightly: setup-dev  ## The tests that are too long for every run, and far more random cases in the others
 	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest -m "nightly or not nightly" $(PYTEST_ARGS)
 
 # Compiled kernels leave no trace, so the safety code is covered as plain Python.
-SAFETY := iwm_power_manager/actuation/*,iwm_power_manager/control/*
+SAFETY := iwm_power_manager/model/gate.py,iwm_power_manager/model/limits.py,iwm_power_manager/model/torque.py,iwm_power_manager/control/*
 coverage: setup-dev  ## Line and branch coverage of control law, limits, gating and input checks: 100 %
 	@$(BIN)/coverage erase
-	@NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest test/actuation test/control $(PYTEST_ARGS)
+	@NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest test/model test/control $(PYTEST_ARGS)
 	@$(BIN)/coverage combine --quiet
 	@$(BIN)/coverage report --include='$(SAFETY)' --fail-under=100
 

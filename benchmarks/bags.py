@@ -29,14 +29,14 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from iwm_power_manager.bags.definitions import definition_of, typestore
-from iwm_power_manager.bags.joint_state import JOINT_STATE, JointStateEncoder
-from iwm_power_manager.bags.mapping import load_mapping
 from iwm_power_manager.bags.metadata import Qos, Topic
-from iwm_power_manager.bags.plan import WHEEL_NAMES, Choice, make_plan
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.recording import Recording
-from iwm_power_manager.bags.replay import Replay, ReplayOutput
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
+from iwm_power_manager.replay.plan import WHEEL_NAMES, Choice, make_plan
+from iwm_power_manager.replay.run import Replay, ReplayOutput
+from iwm_power_manager.signals.joint_state import JOINT_STATE, JointStateEncoder
+from iwm_power_manager.signals.mapping import load_mapping
 
 TWIST, FLOAT64 = "geometry_msgs/msg/TwistStamped", "std_msgs/msg/Float64"
 TOPICS = 5

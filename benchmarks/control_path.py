@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from iwm_sim.latency import main
+from iwm_sim.campaigns.latency import main
 
 if __name__ == "__main__":
     sys.exit(main())

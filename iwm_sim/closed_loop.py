@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from iwm_power_manager.actuation.limits import battery_limits_w
 from iwm_power_manager.control import law
 from iwm_power_manager.control.types import ControllerState, Measurement, Settings, initial_state
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.driver import DriverState, Trace, drive, sample
+from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.model.tyre import slip_ratio
 from iwm_power_manager.policy import PolicyTable
 from iwm_power_manager.vehicle import Vehicle, VehicleParams

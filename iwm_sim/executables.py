@@ -7,17 +7,17 @@ from iwm_power_manager.executables import INTERRUPTED, NODE_ENDED, run
 
 def demo() -> int:
     """Command `demo`."""
-    return run("iwm_sim.demo", INTERRUPTED)
+    return run("iwm_sim.tools.demo", INTERRUPTED)
 
 
 def evaluate() -> int:
     """Command `evaluate`."""
-    return run("iwm_sim.study.evaluate", INTERRUPTED)
+    return run("iwm_sim.tools.evaluate", INTERRUPTED)
 
 
 def learn_policy() -> int:
     """Command `learn_policy`."""
-    return run("iwm_sim.learn", INTERRUPTED)
+    return run("iwm_sim.tools.learn", INTERRUPTED)
 
 
 def simulator() -> int:

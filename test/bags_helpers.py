@@ -10,12 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from iwm_power_manager.bags import steps
 from iwm_power_manager.bags.definitions import definition_of, typestore
-from iwm_power_manager.bags.joint_state import JOINT_STATE, JointStateEncoder
 from iwm_power_manager.bags.metadata import Qos, Topic
-from iwm_power_manager.bags.plan import WHEEL_NAMES
-from iwm_power_manager.bags.replay import COMPUTED
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
@@ -23,7 +19,11 @@ from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.control.supervision import SupervisionLimits
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.policy import choose, empty_table, load_policy_bank
+from iwm_power_manager.replay import steps
+from iwm_power_manager.replay.plan import WHEEL_NAMES
+from iwm_power_manager.replay.run import COMPUTED
 from iwm_power_manager.share import share_path
+from iwm_power_manager.signals.joint_state import JOINT_STATE, JointStateEncoder
 from iwm_power_manager.vehicle import load_vehicle
 
 FLOAT64 = "std_msgs/msg/Float64"

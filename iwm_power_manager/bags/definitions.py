@@ -8,8 +8,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import BagError
-from .metadata import Topic
+from iwm_power_manager.bags.metadata import Topic
+from iwm_power_manager.errors import BagError
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

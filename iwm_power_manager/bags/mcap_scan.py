@@ -14,8 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from ..errors import BagError
-from .mcap_file import (
+from iwm_power_manager.bags.mcap_file import (
     CHANNEL,
     CHUNK,
     DATA_END,
@@ -26,6 +25,7 @@ from .mcap_file import (
     METADATA,
     SCHEMA,
 )
+from iwm_power_manager.errors import BagError
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")

@@ -17,9 +17,9 @@ from typing import Any, NamedTuple, Self
 
 import yaml
 
-from ..errors import BagError
-from .mcap_scan import McapChannel, McapScan
-from .metadata import CUSTOM_METADATA, METADATA_FILE, Qos, Topic
+from iwm_power_manager.bags.mcap_scan import McapChannel, McapScan
+from iwm_power_manager.bags.metadata import CUSTOM_METADATA, METADATA_FILE, Qos, Topic
+from iwm_power_manager.errors import BagError
 
 _SUFFIXES = (".mcap", ".db3")
 _COMPRESSED_SUFFIX = ".zstd"

@@ -18,9 +18,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from ..errors import BagError
-from .metadata import Topic
-from .writer import BagWriter, MessageTooLarge, WriterOptions
+from iwm_power_manager.bags.metadata import Topic
+from iwm_power_manager.bags.writer import BagWriter, MessageTooLarge, WriterOptions
+from iwm_power_manager.errors import BagError
 
 #: One message: topic number, log time (ns), CDR bytes, publish time (ns), the publisher's counter.
 Sample = tuple[int, int, bytes, int, int]

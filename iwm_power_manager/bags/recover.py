@@ -11,12 +11,12 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from ..errors import BagError
-from .mcap_file import McapFile
-from .mcap_scan import McapScan
-from .metadata import CUSTOM_METADATA, METADATA_FILE, FileSpan, Topic
-from .reader import BagReader, custom_data_of, recording_order, topic_of
-from .writer import LIBRARY, announce, finish, span_of, write_metadata
+from iwm_power_manager.bags.mcap_file import McapFile
+from iwm_power_manager.bags.mcap_scan import McapScan
+from iwm_power_manager.bags.metadata import CUSTOM_METADATA, METADATA_FILE, FileSpan, Topic
+from iwm_power_manager.bags.reader import BagReader, custom_data_of, recording_order, topic_of
+from iwm_power_manager.bags.writer import LIBRARY, announce, finish, span_of, write_metadata
+from iwm_power_manager.errors import BagError
 
 
 class FileRecovery(NamedTuple):

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from .. import __version__
-from ..errors import BagError, ConfigError
-from ..files import atomic_write, sync_folder
-from .mcap_file import COMPRESSIONS, McapFile
-from .metadata import (
+from iwm_power_manager import __version__
+from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
+from iwm_power_manager.bags.metadata import (
     CUSTOM_METADATA,
     METADATA_FILE,
     FileSpan,
@@ -27,6 +25,8 @@ from .metadata import (
     metadata_text,
     qos_text,
 )
+from iwm_power_manager.errors import BagError, ConfigError
+from iwm_power_manager.files import atomic_write, sync_folder
 
 LIBRARY = f"iwm_power_manager {__version__}"
 DEFAULT_CHUNK_BYTES = 786_432

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from iwm_power_manager.actuation.limits import battery_limits_w
 from iwm_power_manager.control import law
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
@@ -26,6 +25,7 @@ from iwm_power_manager.control.supervision import (
     supervise,
 )
 from iwm_power_manager.control.types import Command, Measurement, Settings, initial_state
+from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.policy import PolicyTable
 from iwm_power_manager.vehicle import VehicleParams
 

@@ -19,9 +19,6 @@ from __future__ import annotations
 
 import math
 
-from iwm_power_manager.actuation.gate import axle_gated, gated_split
-from iwm_power_manager.actuation.limits import battery_scale, car_power_w
-from iwm_power_manager.actuation.torque import allocate, blend, conversion_speed_radps
 from iwm_power_manager.control.slew import approached, slewed
 from iwm_power_manager.control.slip import UNLIMITED_NM, axle_slip, filtered, road_torque_nm, torque_room_nm
 from iwm_power_manager.control.split import decide
@@ -42,7 +39,10 @@ from iwm_power_manager.control.types import (
     Settings,
 )
 from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.gate import axle_gated, gated_split
+from iwm_power_manager.model.limits import battery_scale, car_power_w
 from iwm_power_manager.model.motor import heat_after, regeneration_limit_nm, torque_limit_nm
+from iwm_power_manager.model.torque import allocate, blend, conversion_speed_radps
 from iwm_power_manager.policy import PolicyTable
 from iwm_power_manager.vehicle import VehicleParams
 

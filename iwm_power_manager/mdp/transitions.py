@@ -12,9 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iwm_power_manager.actuation.gate import axle_gated, gated_split
-from iwm_power_manager.actuation.limits import battery_scale, car_power_w
-from iwm_power_manager.actuation.torque import blend, conversion_speed_radps
 from iwm_power_manager.grid import locate
 from iwm_power_manager.jit import kernel, parallel_kernel
 from iwm_power_manager.mdp.policy_iteration import Model, list_cells
@@ -31,9 +28,12 @@ from iwm_power_manager.mdp.problem import (
 from iwm_power_manager.mdp.threads import over_ranges
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
+from iwm_power_manager.model.gate import axle_gated, gated_split
+from iwm_power_manager.model.limits import battery_scale, car_power_w
 from iwm_power_manager.model.longitudinal import step
 from iwm_power_manager.model.motor import idle_drag_nm, torque_limit_nm
 from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
+from iwm_power_manager.model.torque import blend, conversion_speed_radps
 from iwm_power_manager.model.tyre import slip_ratio
 from iwm_power_manager.vehicle import VehicleParams
 

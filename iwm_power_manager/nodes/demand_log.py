@@ -6,10 +6,10 @@ import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from iwm_power_manager.bags.demand_counts import DemandCounter, load_transitions, save_transitions
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.control.supervision import MODE_NORMAL
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.mdp.demand_counts import DemandCounter, load_transitions, save_transitions
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import PolicyTable
 from iwm_power_manager.ros import diagnostics

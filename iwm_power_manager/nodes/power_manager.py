@@ -36,12 +36,13 @@ from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.demand_log import DemandLog
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport
-from iwm_power_manager.ros import diagnostics, ending, messages, qos, quick, realtime
+from iwm_power_manager.ros import diagnostics, ending, messages, qos, realtime
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
 from iwm_power_manager.share import resolve
+from iwm_power_manager.signals import live as quick
 from iwm_power_manager.vehicle import load_vehicle
 
 _COMMANDS = (messages.WHEEL_TORQUE_COMMAND, messages.FRICTION_BRAKE_COMMAND)

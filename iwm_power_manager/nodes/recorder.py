@@ -28,18 +28,18 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from .. import __version__
-from ..bags.definitions import definition_of
-from ..bags.mcap_file import COMPRESSIONS
-from ..bags.metadata import Topic
-from ..bags.recording import FAILED, Recording, RecordingOptions, Sample
-from ..bags.recover import recover
-from ..bags.writer import WriterOptions
-from ..errors import BagError, IwmError
-from ..files import content_sha256
-from ..ros import ending
-from ..ros.interruption import Interruption
-from ..ros.messages import (
+from iwm_power_manager import __version__
+from iwm_power_manager.bags.definitions import definition_of
+from iwm_power_manager.bags.mcap_file import COMPRESSIONS
+from iwm_power_manager.bags.metadata import Topic
+from iwm_power_manager.bags.recording import FAILED, Recording, RecordingOptions, Sample
+from iwm_power_manager.bags.recover import recover
+from iwm_power_manager.bags.writer import WriterOptions
+from iwm_power_manager.errors import BagError, IwmError
+from iwm_power_manager.files import content_sha256
+from iwm_power_manager.ros import ending
+from iwm_power_manager.ros.interruption import Interruption
+from iwm_power_manager.ros.messages import (
     CLOCK,
     FRICTION_BRAKE_COMMAND,
     POWER_DEMAND,
@@ -50,10 +50,10 @@ from ..ros.messages import (
     WHEEL_TORQUE_COMMAND,
     ns_to_stamp,
 )
-from ..ros.parameters import Change, ParameterError, Spec, declare
-from ..ros.raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET, RawSubscriptions, Taken
-from ..ros.remote_parameters import RemoteParameters
-from ..share import resolve
+from iwm_power_manager.ros.parameters import Change, ParameterError, Spec, declare
+from iwm_power_manager.ros.raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET, RawSubscriptions, Taken
+from iwm_power_manager.ros.remote_parameters import RemoteParameters
+from iwm_power_manager.share import resolve
 
 DIAGNOSTICS = "/diagnostics"
 DEFAULT_TOPICS = [*TOPIC_TYPES, DIAGNOSTICS]

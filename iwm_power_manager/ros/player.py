@@ -20,14 +20,14 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from ..bags.mapping import topic_named
-from ..bags.reader import BagReader, Message
-from ..bags.replay import COMPUTED
-from ..errors import BagError
-from . import ending
-from .interruption import Interruption
-from .messages import CLOCK, clock_message
-from .raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET
+from iwm_power_manager.bags.reader import BagReader, Message
+from iwm_power_manager.errors import BagError
+from iwm_power_manager.replay.run import COMPUTED
+from iwm_power_manager.ros import ending
+from iwm_power_manager.ros.interruption import Interruption
+from iwm_power_manager.ros.messages import CLOCK, clock_message
+from iwm_power_manager.ros.raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET
+from iwm_power_manager.signals.mapping import topic_named
 
 #: Not inputs: what nodes say about themselves.
 _NOT_PLAYED = ("/diagnostics", "/rosout", "/parameter_events", CLOCK)

@@ -21,8 +21,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from ..bags.metadata import INFINITE_NS, Qos
-from .intake import Unattended, never_called
+from iwm_power_manager.bags.metadata import INFINITE_NS, Qos
+from iwm_power_manager.ros.intake import Unattended, never_called
 
 #: One message as it was taken: topic number, received (ns), bytes, sent (ns), the publisher's counter.
 Taken = tuple[int, int, bytes, int, int]

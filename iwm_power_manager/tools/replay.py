@@ -18,17 +18,17 @@ from typing import Any
 
 from tqdm import tqdm
 
-from .. import __version__
-from ..bags.mapping import SignalMapping, load_mapping
-from ..bags.plan import Choice, Plan, make_plan
-from ..bags.reader import BagReader
-from ..bags.replay import Replay, ReplayOutput, ReplayReport, exceeds
-from ..bags.what_if import Consumption, strategy_name, what_if
-from ..bags.writer import BagWriter, WriterOptions
-from ..control.types import STRATEGIES
-from ..errors import BagError, ConfigError, IwmError
-from ..files import atomic_write, check_number
-from ..share import resolve
+from iwm_power_manager import __version__
+from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.bags.writer import BagWriter, WriterOptions
+from iwm_power_manager.control.types import STRATEGIES
+from iwm_power_manager.errors import BagError, ConfigError, IwmError
+from iwm_power_manager.files import atomic_write, check_number
+from iwm_power_manager.replay.plan import Choice, Plan, make_plan
+from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds
+from iwm_power_manager.replay.what_if import Consumption, strategy_name, what_if
+from iwm_power_manager.share import resolve
+from iwm_power_manager.signals.mapping import SignalMapping, load_mapping
 
 DONE, DIFFERENT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -189,7 +189,7 @@ def _consumption_line(row: Consumption, reference: Consumption) -> str:
 
 
 def _publish(options: argparse.Namespace) -> int:
-    from ..ros.player import PlayOptions, play
+    from iwm_power_manager.ros.player import PlayOptions, play
 
     with BagReader(options.bag) as bag:
         return play(

@@ -20,9 +20,6 @@ import numpy as np
 from tqdm import tqdm
 
 from iwm_power_manager import __version__
-from iwm_power_manager.bags.demand_counts import transitions_source
-from iwm_power_manager.bags.mapping import load_mapping
-from iwm_power_manager.bags.signals import RecordedDrive, read_signal
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.files import atomic_write, check_number
@@ -35,11 +32,14 @@ from iwm_power_manager.mdp.demand import (
     signal_source,
     source_of,
 )
+from iwm_power_manager.mdp.demand_counts import transitions_source
 from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
 from iwm_power_manager.mdp.problem import Problem, load_problem
 from iwm_power_manager.mdp.transitions import build_model
 from iwm_power_manager.policy import Policy, cost_quantum_j, load_policy, make_policy, save_policy
 from iwm_power_manager.share import resolve
+from iwm_power_manager.signals.mapping import load_mapping
+from iwm_power_manager.signals.recorded import RecordedDrive, read_signal
 from iwm_power_manager.tools.solver_figures import draw_solution
 from iwm_power_manager.vehicle import IDLE_DRIVES, Vehicle, load_vehicle
 

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba.core import config as numba_config
 
-from iwm_power_manager.actuation.limits import car_power_w
 from iwm_power_manager.control import controller as module
 from iwm_power_manager.control import law
 from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
@@ -30,6 +29,7 @@ from iwm_power_manager.control.supervision import (
     SupervisionLimits,
 )
 from iwm_power_manager.control.types import GATE_BOTH, GATE_FRONT, GATE_REAR, default_settings, initial_state
+from iwm_power_manager.model.limits import car_power_w
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import resolve

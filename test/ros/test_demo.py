@@ -51,7 +51,7 @@ class Finished(NamedTuple):
 
 
 def demo(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "iwm_sim.demo", *map(str, arguments)]
+    return [sys.executable, "-m", "iwm_sim.tools.demo", *map(str, arguments)]
 
 
 @pytest.fixture(scope="module")

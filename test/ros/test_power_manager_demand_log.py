@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iwm_power_manager.bags.demand_counts import DemandTransitions, load_transitions, save_transitions
 from iwm_power_manager.mdp.demand import count_steps
+from iwm_power_manager.mdp.demand_counts import DemandTransitions, load_transitions, save_transitions
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.share import share_path
 

@@ -15,8 +15,8 @@ import pytest
 
 from bags_helpers import ScriptedDrive
 from iwm_power_manager.bags.reader import BagReader
-from iwm_power_manager.bags.replay import FRICTION_COMMAND, MOTOR_COMMAND
 from iwm_power_manager.policy import load_policy, save_policy
+from iwm_power_manager.replay.run import FRICTION_COMMAND, MOTOR_COMMAND
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.replay import DIFFERENT, DONE, main
 

@@ -9,12 +9,12 @@ import sys
 import numpy as np
 import pytest
 
-from iwm_power_manager.bags.signals import RecordedDrive
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.mdp.demand import chain_of, cycle_power_w, cycle_source, driven_source
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import load_policy, load_policy_bank, policy_bytes
 from iwm_power_manager.share import share_path
+from iwm_power_manager.signals.recorded import RecordedDrive
 from iwm_power_manager.tools import solve_policy
 from iwm_power_manager.vehicle import load_vehicle
 

@@ -1,0 +1,201 @@
+"""With what a bag is replayed: car, policies, settings of the law. From the options, else from the bag itself."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from iwm_power_manager.control.types import (
+    GATE_MODES,
+    PREVIEW,
+    SDP,
+    SDP_LOOKAHEAD,
+    STRATEGIES,
+    Settings,
+    default_settings,
+)
+from iwm_power_manager.errors import ConfigError, PolicyError
+from iwm_power_manager.files import check_number, content_sha256
+from iwm_power_manager.policy import Policy, PolicyTable, choose, empty_table, load_policy_bank
+from iwm_power_manager.share import resolve
+from iwm_power_manager.vehicle import Vehicle, load_vehicle
+
+DEFAULT_VEHICLE = "config/vehicles/jalalmaab_2015.yaml"
+DEFAULT_POLICY = "policies"
+DEFAULT_FRICTION = 0.9
+DEFAULT_RATE_HZ = 100.0
+WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
+
+_NODE = "/power_manager"
+_PARAMETERS = "parameters "
+_NEED_POLICY = (SDP, SDP_LOOKAHEAD)
+
+
+class Choice(NamedTuple):
+    """What the user has chosen; None and () leave it to the bag.
+
+    Attributes
+    ----------
+    vehicle, policy : files, or names among the package's files
+    strategy : one of `STRATEGIES`
+    friction : peak friction coefficient
+    settings : settings of the law, as text: ("critical_slip=0.1", ...)
+    """
+
+    vehicle: str | None = None
+    policy: str | None = None
+    strategy: str | None = None
+    friction: float | None = None
+    settings: Sequence[str] = ()
+
+
+class PolicyBank:
+    """Policies by friction, loaded when a strategy first needs one.
+
+    Parameters
+    ----------
+    path : file or folder; "" for none
+    rule : coefficients of the strategy `rule`
+    vehicle : the car they have to be solved for
+    """
+
+    def __init__(self, path: str, rule: Sequence[float], vehicle: Vehicle) -> None:
+        self._path = path
+        self._rule = tuple(rule)
+        self._vehicle = vehicle
+        self._bank: list[Policy] | None = None
+        self._tables: dict[float, PolicyTable] = {}
+        self._empty = empty_table(rule=self._rule)
+
+    def table(self, strategy: int, friction: float) -> PolicyTable:
+        """Numbers for the law, of the policy whose friction is nearest.
+
+        Raises
+        ------
+        PolicyError
+            The strategy needs a policy, and there is none that is whole and for this car.
+        """
+        if strategy not in _NEED_POLICY:
+            return self._empty
+        if friction not in self._tables:
+            policy = choose(self._loaded(), friction)
+            self._tables[friction] = policy.table(self._rule)
+        return self._tables[friction]
+
+    @property
+    def checksums(self) -> list[str]:
+        """Identities of the policies loaded so far."""
+        return [policy.checksum for policy in self._bank or []]
+
+    @property
+    def content_sha256(self) -> str:
+        """Hash of the file or folder, as a recorder takes it; "" if no step needed a policy."""
+        return content_sha256(resolve(self._path)) if self._bank else ""
+
+    def _loaded(self) -> list[Policy]:
+        if self._bank is None:
+            if not self._path:
+                raise PolicyError("the strategy needs a policy; name one with --policy")
+            self._bank = load_policy_bank(resolve(self._path), self._vehicle)
+        return self._bank
+
+
+class Plan(NamedTuple):
+    """Everything a replay needs beside the bag.
+
+    Attributes
+    ----------
+    vehicle : the car
+    policies : the tables
+    changes : settings that replace the recorded ones, step by step
+    settings : settings where the bag has recorded none
+    friction : where the bag has recorded none
+    keeps_friction : the recorded friction is not replaced
+    wheel_names : of the recomputed commands
+    period_s : length of a step that has none before it
+    """
+
+    vehicle: Vehicle
+    policies: PolicyBank
+    changes: dict[str, Any]
+    settings: Settings
+    friction: float
+    keeps_friction: bool
+    wheel_names: tuple[str, ...]
+    period_s: float
+
+
+def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
+    """Plan from the user's choice; what that leaves open comes from the parameters recorded in the bag, else defaults.
+
+    Raises
+    ------
+    ConfigError, PolicyError
+        An option is wrong, or a file cannot be used.
+    """
+    recorded = recorded_parameters(custom_data)
+    idle_drive = recorded.get("idle_drive") or None if choice.vehicle is None else None
+    vehicle = load_vehicle(resolve(choice.vehicle or recorded.get("vehicle_file") or DEFAULT_VEHICLE), idle_drive)
+    changes = dict(_setting(text) for text in choice.settings)
+    if choice.strategy is not None:
+        changes["strategy"] = _strategy(choice.strategy)
+    settings = default_settings(str(recorded.get("strategy") or "sdp"))
+    known = {name: recorded[name] for name in Settings._fields if name in recorded and name != "strategy"}
+    if "gate_mode" in known:
+        known["gate_mode"] = GATE_MODES[known["gate_mode"]]
+    wheel_names = tuple(recorded.get("wheel_names") or WHEEL_NAMES)
+    policy = choice.policy if choice.policy is not None else recorded.get("policy_file", DEFAULT_POLICY)
+    return Plan(
+        vehicle,
+        PolicyBank(str(policy), recorded.get("rule") or (), vehicle),
+        changes,
+        settings._replace(**known)._replace(**changes),
+        choice.friction if choice.friction is not None else float(recorded.get("friction", DEFAULT_FRICTION)),
+        choice.friction is None,
+        wheel_names,
+        1.0 / float(recorded.get("rate_hz", DEFAULT_RATE_HZ)),
+    )
+
+
+def recorded_parameters(custom_data: Mapping[str, str]) -> dict[str, Any]:
+    """Parameters the bag's power manager ran with; empty if the bag does not say."""
+    for key, text in sorted(custom_data.items()):
+        if key.startswith(_PARAMETERS) and key.endswith(_NODE):
+            try:
+                found = json.loads(text)
+            except ValueError:
+                continue
+            if isinstance(found, dict):
+                return found
+    return {}
+
+
+def _strategy(name: str) -> int:
+    code = STRATEGIES.get(name)
+    if code is None or code == PREVIEW:
+        allowed = " | ".join(key for key, value in STRATEGIES.items() if value != PREVIEW)
+        raise ConfigError("--strategy", "", f"{name!r} cannot be replayed", allowed)
+    return code
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    name, _, value = text.partition("=")
+    defaults = default_settings()._asdict()
+    del defaults["strategy"]
+    if name not in defaults:
+        raise ConfigError("--set", name, "is no setting of the law", ", ".join(defaults))
+    if name == "gate_mode":
+        if value not in GATE_MODES:
+            raise ConfigError("--set", name, f"{value!r} is unknown", " | ".join(GATE_MODES))
+        return name, GATE_MODES[value]
+    if isinstance(defaults[name], bool):
+        if value not in ("true", "false"):
+            raise ConfigError("--set", name, f"{value!r} is neither true nor false", "true | false")
+        return name, value == "true"
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    return name, check_number("--set", name, number, 0.0)

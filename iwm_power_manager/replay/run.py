@@ -1,0 +1,265 @@
+"""Run the control law over a recorded drive: no DDS, no clock; the same bag gives the same bytes every time.
+
+Where the bag holds `power_manager/state`, each step is repeated from exactly what the law took, so that an unchanged
+law with unchanged policy gives the recorded commands bit by bit. Where it does not (another car's bag, or inputs only),
+steps are made from the mapped input signals.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+from iwm_power_manager.bags.definitions import definition_of
+from iwm_power_manager.bags.metadata import Qos, Topic
+from iwm_power_manager.bags.reader import BagReader, Message
+from iwm_power_manager.bags.writer import BagWriter
+from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.errors import BagError, IwmError
+from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
+from iwm_power_manager.replay.plan import Plan
+from iwm_power_manager.replay.steps import DECIDED_NAMES, ReconstructedSteps, RecordedSteps, ReplayedStep
+from iwm_power_manager.signals.joint_state import JOINT_STATE, JointStateDecoder, JointStateEncoder
+from iwm_power_manager.signals.mapping import SignalMapping, topic_named
+from iwm_power_manager.signals.recorded import SignalStream, check_signals
+
+MOTOR_COMMAND = "wheel_torque_command"
+FRICTION_COMMAND = "friction_brake_command"
+STATE = "power_manager/state"
+#: What a replay computes anew.
+COMPUTED = (MOTOR_COMMAND, FRICTION_COMMAND, STATE)
+
+_PROGRESS_EVERY = 2000
+_FIRST_DECIDED = SIGNAL_NAMES.index(DECIDED_NAMES[0])
+
+
+class ReplayReport(NamedTuple):
+    """What a replay did.
+
+    Attributes
+    ----------
+    exact : steps were repeated from the recorded state; else made from the inputs
+    messages : read
+    steps : control steps taken
+    first_stamp_ns, last_stamp_ns : of the steps
+    gaps : times at which steps are missing in the record, so that the law's memory is unknown
+    restarts : pauses in the inputs after which the law started anew
+    bad_messages : messages that could not be decoded
+    dropped : inputs that were not believed, by topic and reason
+    faults : steps whose command no motor may be given, by reason
+    damage : what could not be read of the bag
+    comparison : recomputed against recorded, by topic
+    """
+
+    exact: bool
+    messages: int
+    steps: int
+    first_stamp_ns: int
+    last_stamp_ns: int
+    gaps: int
+    restarts: int
+    bad_messages: int
+    dropped: dict[str, dict[str, int]]
+    faults: dict[str, int]
+    damage: list[str]
+    comparison: list[TopicComparison]
+
+
+class Replay:
+    """One pass over a bag.
+
+    Parameters
+    ----------
+    bag : open bag
+    plan : car, policies, settings
+    mapping : signals, where the bag holds no state of the power manager
+    tolerance : largest difference that is none, for the comparison
+
+    Raises
+    ------
+    BagError
+        The bag holds neither a state nor the signals that are needed.
+    """
+
+    def __init__(self, bag: BagReader, plan: Plan, mapping: SignalMapping, tolerance: float = 0.0) -> None:
+        self._bag = bag
+        self._plan = plan
+        self._names = {kind: topic_named(kind, bag.topics) for kind in COMPUTED}
+        self._state_topic = _with_messages(bag, self._names[STATE])
+        self._recorded: RecordedSteps | None = None
+        self._reconstructed: ReconstructedSteps | None = None
+        self._stream: SignalStream | None = None
+        self._bad_messages = 0
+        self._messages = 0
+        self._steps = 0
+        self._stamps = (0, 0)
+        self._comparers = {
+            kind: TopicComparer(name, tolerance) for kind, name in self._names.items() if name is not None
+        }
+        self._decoders = {
+            name: (kind, JointStateDecoder("position" if kind == STATE else "effort"))
+            for kind, name in self._names.items()
+            if name is not None
+        }
+        if self._state_topic is not None:
+            self._recorded = RecordedSteps(plan)
+        else:
+            self._stream = SignalStream(bag, mapping)
+            check_signals(bag, mapping, self._stream, plan.vehicle.params)
+            if "wheel_speed" not in self._stream.signals:
+                raise BagError(f"{bag.path}: holds no topic that {mapping.path} maps to wheel_speed")
+            probe = itertools.islice(self._stream, 1000)
+            self._reconstructed = ReconstructedSteps(plan, self._stream.signals, probe)
+            self._stream.bad_messages = 0
+
+    @property
+    def exact(self) -> bool:
+        """Steps are repeated from the recorded state."""
+        return self._recorded is not None
+
+    def steps(self, progress: Callable[[int, int], None] | None = None) -> Iterator[tuple[Message, list[ReplayedStep]]]:
+        """Every message of the bag, with the steps it caused.
+
+        `progress(messages, log_time_ns)` is called now and then.
+        """
+        for message in self._bag.messages():
+            self._messages += 1
+            if progress is not None and self._messages % _PROGRESS_EVERY == 0:
+                progress(self._messages, message.log_time_ns)
+            steps = self._take(message)
+            if steps:
+                self._stamps = (self._stamps[0] if self._steps else steps[0].stamp_ns, steps[-1].stamp_ns)
+                self._steps += len(steps)
+                for step in steps:
+                    self._compare(step)
+            yield message, steps
+
+    def report(self) -> ReplayReport:
+        """What has been done so far."""
+        source = self._recorded or self._reconstructed
+        return ReplayReport(
+            self.exact,
+            self._messages,
+            self._steps,
+            *self._stamps,
+            self._recorded.gaps if self._recorded else 0,
+            self._reconstructed.restarts if self._reconstructed else 0,
+            self._bad_messages + (self._stream.bad_messages if self._stream else 0),
+            self._reconstructed.dropped if self._reconstructed else {},
+            dict(source.faults) if source else {},
+            self._bag.damage,
+            [result for comparer in self._comparers.values() if (result := comparer.result()).has_record],
+        )
+
+    def _take(self, message: Message) -> list[ReplayedStep]:
+        known = self._decoders.get(message.topic)
+        if known is not None:
+            return self._take_computed(message, *known)
+        if self._stream is None or self._reconstructed is None:
+            return []
+        values = self._stream.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns)
+        return self._reconstructed.take(values) if values else []
+
+    def _take_computed(self, message: Message, kind: str, decode: JointStateDecoder) -> list[ReplayedStep]:
+        """A recorded command or state: what the recomputed one is held against, and where the state is, a step."""
+        try:
+            recorded = decode(message.data)
+            steps: list[ReplayedStep] = []
+            if kind == STATE and self._recorded is not None:
+                step = self._recorded.take(recorded, message.log_time_ns, message.publish_time_ns)
+                steps = [step] if step is not None else []
+        except IwmError:
+            raise
+        except KeyError as error:
+            raise BagError(
+                f"{self._bag.path}: {message.topic} lacks the signal {error}: recorded by another version"
+            ) from None
+        except Exception:  # noqa: BLE001 - generated decoders raise whatever a damaged message makes them raise
+            self._bad_messages += 1
+            return []
+        names, values = recorded.names, recorded.values
+        if kind == STATE:
+            found = dict(zip(names, values, strict=True))
+            names, values = DECIDED_NAMES, tuple(found.get(name, math.nan) for name in DECIDED_NAMES)
+        self._comparers[kind].recorded(recorded.stamp_ns, message.log_time_ns, names, values)
+        return steps
+
+    def _compare(self, step: ReplayedStep) -> None:
+        names = self._plan.wheel_names
+        for kind, wanted, values in (
+            (MOTOR_COMMAND, names, step.command.motor_torque_nm),
+            (FRICTION_COMMAND, names, step.command.friction_torque_nm),
+            (STATE, DECIDED_NAMES, decided_values(step)),
+        ):
+            comparer = self._comparers.get(kind)
+            if comparer is not None:
+                comparer.recomputed(step.stamp_ns, step.log_time_ns, wanted, tuple(values))
+
+
+class ReplayOutput:
+    """Writes a replay to a new bag: all recorded inputs as they are, commands and state recomputed.
+
+    Parameters
+    ----------
+    writer : new bag
+    bag : bag that is replayed
+    plan : for the wheels' names
+    """
+
+    def __init__(self, writer: BagWriter, bag: BagReader, plan: Plan) -> None:
+        self._writer = writer
+        self._sequence = 0
+        computed = {name for kind in COMPUTED if (name := topic_named(kind, bag.topics)) is not None}
+        self._copied = {
+            name: writer.add_topic(topic) for name, topic in sorted(bag.topics.items()) if name not in computed
+        }
+        self._numbers = []
+        for kind in COMPUTED:
+            name = topic_named(kind, bag.topics)
+            topic = bag.topics[name] if name is not None else Topic(f"/{kind}", *_joint_state_type(), (Qos(depth=100),))
+            self._numbers.append(writer.add_topic(topic))
+        self._wheels = JointStateEncoder(plan.wheel_names, "effort")
+        self._state = JointStateEncoder(SIGNAL_NAMES, "position")
+
+    def write(self, message: Message, steps: Sequence[ReplayedStep]) -> None:
+        """Write a message of the replayed bag, unless it is recomputed, and the steps it caused."""
+        number = self._copied.get(message.topic)
+        if number is not None:
+            self._writer.write(number, message.log_time_ns, message.data, message.publish_time_ns, message.sequence)
+        for step in steps:
+            self._sequence += 1
+            for topic, data in zip(
+                self._numbers,
+                (
+                    self._wheels(step.stamp_ns, step.command.motor_torque_nm),
+                    self._wheels(step.stamp_ns, step.command.friction_torque_nm),
+                    self._state(step.stamp_ns, step.values),
+                ),
+                strict=True,
+            ):
+                self._writer.write(topic, step.log_time_ns, data, step.publish_time_ns, self._sequence)
+
+
+def exceeds(comparison: Sequence[TopicComparison], tolerance: float) -> bool:
+    """Whether any topic differs by more than the tolerance, or nothing could be compared."""
+    return not any(topic.compared for topic in comparison) or any(topic.largest > tolerance for topic in comparison)
+
+
+def decided_values(step: ReplayedStep) -> tuple[float, ...]:
+    """Of a step's numbers, those the law decided."""
+    return tuple(step.values[_FIRST_DECIDED : _FIRST_DECIDED + len(DECIDED_NAMES)])
+
+
+def _with_messages(bag: BagReader, topic: str | None) -> str | None:
+    """The topic, if at least one message of it was recorded."""
+    if topic is None:
+        return None
+    if bag.counts:
+        return topic if bag.counts.get(topic) else None
+    return topic if any(message.topic == topic for message in bag.messages()) else None
+
+
+def _joint_state_type() -> tuple[str, str, str]:
+    return (JOINT_STATE, *definition_of(JOINT_STATE))

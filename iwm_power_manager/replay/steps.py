@@ -1,0 +1,352 @@
+"""From the messages of a bag to control steps: repeated exactly where the bag has them, else made from the inputs."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from iwm_power_manager.control import law, lockstep
+from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
+from iwm_power_manager.control.guard import violated_bound
+from iwm_power_manager.control.inputs import ValueLimits, WheelLimits
+from iwm_power_manager.control.monitor import (
+    BATTERY,
+    DEMAND,
+    FRICTION,
+    SPEED,
+    WHEELS,
+    BatteryReading,
+    InputLimits,
+    JointReading,
+    SpeedReading,
+)
+from iwm_power_manager.control.record import SIGNAL_NAMES, from_numbers
+from iwm_power_manager.control.supervision import SupervisionLimits
+from iwm_power_manager.control.types import Command, ControllerState, initial_state
+from iwm_power_manager.model.pedals import pedal_power_w
+from iwm_power_manager.replay.plan import WHEEL_NAMES, Plan
+from iwm_power_manager.signals.joint_state import NamedValues
+from iwm_power_manager.signals.recorded import SignalValue
+
+_NS_PER_S = 1_000_000_000
+_NAN = float("nan")
+_INF = float("inf")
+
+#: A pause in the recording longer than this starts the law anew.
+_PAUSE_S = 1.0
+#: Values from the start of a bag that show whether its messages come in sets of one stamp.
+_PROBE_VALUES = 400
+
+#: What recorded inputs are judged by: finite, and physically possible. Stamps are not judged: there is no clock here.
+INPUT_LIMITS = InputLimits(
+    stamp=None,
+    demand_delay_s=_INF,
+    speed=ValueLimits(-1.0, 150.0, 100.0, 100.0, 1.0),
+    demand=ValueLimits(-2e7, 5e6, _INF, _INF, 0.0),
+    soc=ValueLimits(0.0, 1.0, _INF, _INF, 0.0),
+    temperature=ValueLimits(-60.0, 150.0, _INF, _INF, 0.0),
+    friction=ValueLimits(0.05, 1.5, _INF, _INF, 0.0),
+    wheels=WheelLimits(
+        value=ValueLimits(-2000.0, 2000.0, 1e4, 1e4, 3.0),
+        opposite_radps=3.0,
+        moving_mps=1.0,
+        stuck_s=_INF,
+        stuck_change_radps=1.0,
+        stray_s=_INF,
+        stray_radps=500.0,
+        distrust_s=0.5,
+    ),
+    radius_m=_NAN,
+)
+
+
+class ReplayedStep(NamedTuple):
+    """One step of the law.
+
+    Attributes
+    ----------
+    stamp_ns : of the command
+    log_time_ns, publish_time_ns : of the message that caused the step
+    command : what it decided
+    before, after : its memory
+    values : numbers of `control.record.SIGNALS`
+    """
+
+    stamp_ns: int
+    log_time_ns: int
+    publish_time_ns: int
+    command: Command
+    before: ControllerState
+    after: ControllerState
+    values: Sequence[float]
+
+
+class RecordedSteps:
+    """Repeats the steps a `power_manager/state` has recorded, bit by bit as long as none is missing.
+
+    Attributes
+    ----------
+    gaps : times at which the law's memory is unknown, because steps before are not in the bag
+    faults : steps whose command no motor may be given; they come without a command
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.gaps = 0
+        self.faults: Counter[str] = Counter()
+        self._plan = plan
+        self._state = initial_state()
+        self._next = 0
+        self._last: ReplayedStep | None = None
+
+    def take(self, recorded: NamedValues, log_time_ns: int, publish_time_ns: int) -> ReplayedStep | None:
+        """Repeat one step; `KeyError` if the message is of another kind or version."""
+        values = dict(zip(recorded.names, recorded.values, strict=True))
+        number = int(values["step"])
+        last = self._last
+        if last is not None and last.stamp_ns == recorded.stamp_ns and last.before.steps == number:
+            return last._replace(log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)  # an answer, repeated
+        first, measurement, settings = from_numbers(values)
+        if first:
+            self._state = initial_state()
+        elif number != self._next:
+            self.gaps += 1
+            self._state = self._state._replace(steps=number)
+        self._next = number + 1
+        plan = self._plan
+        if plan.changes:
+            settings = settings._replace(**plan.changes)
+        if not plan.keeps_friction:
+            measurement = measurement._replace(friction=plan.friction)
+        table = plan.policies.table(settings.strategy, measurement.friction)
+        before = self._state
+        command, after = law.step(measurement, before, settings, plan.vehicle.params, table)
+        self._state = after
+        problem = violated_bound(command, plan.vehicle.params)
+        if problem:
+            self.faults[problem] += 1
+            return None
+        values.update(decided(command, before, after))
+        if plan.changes or not plan.keeps_friction:
+            values.update({f"setting.{name}": float(value) for name, value in settings._asdict().items()})
+            values["friction"] = measurement.friction
+        self._last = ReplayedStep(
+            recorded.stamp_ns,
+            log_time_ns,
+            publish_time_ns,
+            command,
+            before,
+            after,
+            [values[name] for name in SIGNAL_NAMES],
+        )
+        return self._last
+
+
+class ReconstructedSteps:
+    """Makes steps from recorded inputs: by sets of one stamp as in lock-step, else one step for each wheel speed.
+
+    Parameters
+    ----------
+    plan : car, policies, settings
+    signals : signals the bag holds
+    probe : values from its start
+
+    Attributes
+    ----------
+    in_sets : the inputs come in sets of one stamp
+    restarts : pauses in the recording after which the law started anew
+    faults : steps whose command no motor may be given
+    """
+
+    def __init__(self, plan: Plan, signals: set[str], probe: Iterable[SignalValue]) -> None:
+        self.restarts = 0
+        self.faults: Counter[str] = Counter()
+        self._plan = plan
+        self._from_pedals = "power_demand" not in signals
+        self.in_sets = _in_sets(probe)
+        self._queue = lockstep.LockstepQueue()
+        vehicle = plan.vehicle.params
+        limits = ControllerLimits(
+            INPUT_LIMITS._replace(radius_m=vehicle.wheel.radius_m), None, SupervisionLimits(0.3, 2.0, 0.5, 0.5)
+        )
+        table = plan.policies.table(plan.settings.strategy, plan.friction)
+        self._controller = Controller(vehicle, WHEEL_NAMES, limits, plan.settings, table, plan.friction)
+        self._wheels = [_NAN] * 4
+        self._fresh = [False] * 4
+        self._pedals = [0.0, 0.0]
+        self._speed = 0.0
+        self._last_ns: int | None = None
+
+    @property
+    def dropped(self) -> dict[str, dict[str, int]]:
+        """Inputs that were not believed: counts by reason, by topic."""
+        return {
+            topic: {reason.name.lower(): count for reason, count in tally.dropped.items()}
+            for topic, tally in self._controller.monitor.tallies.items()
+            if tally.dropped
+        }
+
+    def take(self, values: Sequence[SignalValue]) -> list[ReplayedStep]:
+        """The values of one message; returns the steps they cause."""
+        by_signal = {value.signal: value for value in values}
+        ticks = []
+        for value in values:
+            reading = self._reading(value, by_signal)
+            if reading is not None:
+                topic, content, now_ns = reading
+                ticks.append((topic, content, now_ns, value))
+        steps = []
+        for topic, content, now_ns, value in ticks:
+            steps += (
+                self._push(topic, content, now_ns, value) if self.in_sets else self._use(topic, content, now_ns, value)
+            )
+        return steps
+
+    def _reading(
+        self, value: SignalValue, message: dict[str, SignalValue]
+    ) -> tuple[str, SpeedReading | JointReading | BatteryReading | float, int] | None:
+        """What a value tells the controller, if it completes something."""
+        now_ns = value.log_time_ns if value.stamp_ns is None else value.stamp_ns
+        signal = value.signal
+        if signal == "speed":
+            self._speed = max(value.values[0], 0.0)
+            return SPEED, SpeedReading(now_ns, value.values[0]), now_ns
+        if signal == "wheel_speed":
+            if value.wheel >= 0:
+                self._wheels[value.wheel] = value.values[0]
+                self._fresh[value.wheel] = True
+                if not all(self._fresh):
+                    return None
+                self._fresh = [False] * 4
+                return WHEELS, JointReading(now_ns, WHEEL_NAMES, tuple(self._wheels)), now_ns
+            return WHEELS, JointReading(now_ns, WHEEL_NAMES, value.values), now_ns
+        if signal == "soc":
+            temperature = message.get("battery_temperature")
+            degrees = temperature.values[0] if temperature is not None else _NAN
+            return BATTERY, BatteryReading(now_ns, value.values[0], degrees, _NAN, _NAN), now_ns
+        if signal == "friction":
+            return FRICTION, value.values[0], now_ns
+        if signal == "power_demand":
+            return DEMAND, value.values[0], now_ns
+        if signal in ("accelerator_pedal", "brake_pedal") and self._from_pedals:
+            self._pedals[signal == "brake_pedal"] = min(max(value.values[0], 0.0), 1.0)
+            accelerator, brake = self._pedals
+            return DEMAND, float(pedal_power_w(accelerator, brake, self._speed, self._plan.vehicle.params)), now_ns
+        return None
+
+    def _push(self, topic: str, content: object, now_ns: int, value: SignalValue) -> list[ReplayedStep]:
+        """Lock-step: collect a set, step when it is complete."""
+        queue = self._queue
+        if topic == DEMAND:
+            queue.push_demand(value.publish_time_ns, content)
+        elif topic == FRICTION:
+            self._friction(content, now_ns)
+        else:
+            kind = {SPEED: lockstep.SPEED, WHEELS: lockstep.WHEELS, BATTERY: lockstep.BATTERY}[topic]
+            queue.push(kind, now_ns, value.publish_time_ns, content)
+        steps = []
+        while (inputs := queue.pop()) is not None:
+            if inputs.demand is None:
+                continue  # the same set once more
+            stamp = inputs.stamp_ns
+            monitor = self._controller.monitor
+            since_s = self._since_s(stamp, longest_s=_INF)
+            monitor.take_speed(inputs.speed, stamp)
+            monitor.take_wheels(inputs.wheels, stamp)
+            monitor.take_battery(inputs.battery, stamp)
+            monitor.take_demand(inputs.demand, 0.0, stamp)
+            steps += self._step(stamp, self._plan.period_s if since_s is None else since_s, value)
+        return steps
+
+    def _use(self, topic: str, content: object, now_ns: int, value: SignalValue) -> list[ReplayedStep]:
+        """Not in sets: keep the latest of everything, step at the wheel speeds."""
+        monitor = self._controller.monitor
+        if topic == SPEED:
+            monitor.take_speed(content, now_ns)  # type: ignore[arg-type]
+        elif topic == BATTERY:
+            monitor.take_battery(content, now_ns)  # type: ignore[arg-type]
+        elif topic == DEMAND:
+            monitor.take_demand(content, 0.0, now_ns)  # type: ignore[arg-type]
+        elif topic == FRICTION:
+            self._friction(content, now_ns)
+        elif monitor.take_wheels(content, now_ns):  # type: ignore[arg-type]
+            if monitor.tallies[SPEED].accepted_ns is None or monitor.tallies[DEMAND].accepted_ns is None:
+                return []
+            if self._last_ns is not None and now_ns == self._last_ns:
+                return []
+            restarts = self.restarts
+            since_s = self._since_s(now_ns, longest_s=_PAUSE_S)
+            if self.restarts > restarts:
+                self._last_ns = None  # what came before the pause is of no use: wait for speed and demand
+                return []
+            return self._step(now_ns, self._plan.period_s if since_s is None else since_s, value)
+        return []
+
+    def _friction(self, content: object, now_ns: int) -> None:
+        controller = self._controller
+        if self._plan.keeps_friction and controller.monitor.take_friction(content, now_ns):  # type: ignore[arg-type]
+            controller.friction = controller.monitor.friction
+            controller.policy = self._plan.policies.table(self._plan.settings.strategy, controller.friction)
+
+    def _since_s(self, now_ns: int, longest_s: float) -> float | None:
+        """Time since the last step; None, and the law starts anew, at the first, after a pause, or back in time."""
+        if self._last_ns is None:
+            return None
+        since_s = (now_ns - self._last_ns) / _NS_PER_S
+        if 0.0 < since_s <= longest_s:
+            return since_s
+        self.restarts += 1
+        self._controller.reset()
+        return None
+
+    def _step(self, stamp_ns: int, dt_s: float, value: SignalValue) -> list[ReplayedStep]:
+        self._last_ns = stamp_ns
+        controller = self._controller
+        before = controller.state
+        try:
+            command, numbers = controller.step(stamp_ns, dt_s)
+        except ControlFaultError as error:
+            self.faults[str(error)] += 1
+            return []
+        return [
+            ReplayedStep(
+                stamp_ns,
+                value.log_time_ns,
+                value.publish_time_ns,
+                command,
+                before,
+                controller.state,
+                numbers,
+            )
+        ]
+
+
+def decided(command: Command, before: ControllerState, after: ControllerState) -> dict[str, float]:
+    """The signals of `control.record` that the law decides, by name."""
+    numbers = [
+        *command.motor_torque_nm,
+        *command.friction_torque_nm,
+        *(float(value) for value in command[2:]),
+        float(before.steps),
+        after.front_heat,
+        after.rear_heat,
+    ]
+    return dict(zip(DECIDED_NAMES, numbers, strict=True))
+
+
+def _in_sets(probe: Iterable[SignalValue]) -> bool:
+    """Whether speed, wheel speeds and battery come with the same stamps, as in lock-step."""
+    stamps: dict[str, set[int]] = {"speed": set(), "wheel_speed": set(), "soc": set()}
+    for value in itertools.islice(probe, _PROBE_VALUES):
+        if value.signal in stamps:
+            if value.stamp_ns is None:
+                return False
+            stamps[value.signal].add(value.stamp_ns)
+    common = set.intersection(*stamps.values())
+    return len(common) > 1 and len(common) >= max(map(len, stamps.values())) - 2
+
+
+_FIRST_DECIDED = SIGNAL_NAMES.index("front_left_motor_torque_nm")
+#: The signals of `control.record` that the law decides.
+DECIDED_NAMES = tuple(SIGNAL_NAMES[_FIRST_DECIDED : SIGNAL_NAMES.index("rear_heat") + 1])

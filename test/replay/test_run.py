@@ -1,0 +1,497 @@
+"""Replay: bit by bit where nothing has changed, and never silent where something has."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from bags_helpers import TWIST, ScriptedDrive, float64, topic, twist
+from iwm_power_manager.bags.definitions import typestore
+from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.bags.writer import BagWriter
+from iwm_power_manager.control.types import default_settings
+from iwm_power_manager.errors import ConfigError, PolicyError
+from iwm_power_manager.files import content_sha256
+from iwm_power_manager.policy import load_policy, save_policy
+from iwm_power_manager.replay.compare import TopicComparer
+from iwm_power_manager.replay.plan import Choice, make_plan, recorded_parameters
+from iwm_power_manager.replay.run import Replay
+from iwm_power_manager.share import share_path
+from iwm_power_manager.signals.mapping import load_mapping
+from iwm_power_manager.tools.replay import BAD_INPUT, DIFFERENT, DONE, main
+
+COUNT = 150
+STRATEGY = "instantaneous_slip"
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recorded drive with inputs, commands and state."""
+    return ScriptedDrive(STRATEGY).write(tmp_path_factory.mktemp("drive") / "drive", COUNT)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same drive, inputs and commands only."""
+    return ScriptedDrive(STRATEGY).write(tmp_path_factory.mktemp("inputs") / "inputs", COUNT, state=False)
+
+
+def result(capsys: pytest.CaptureFixture[str]) -> dict[str, object]:
+    found: dict[str, object] = json.loads(capsys.readouterr().out)
+    return found
+
+
+@pytest.mark.parametrize("kind", ["drive", "inputs"])
+def test_an_unchanged_law_gives_the_recorded_commands_bit_by_bit(
+    kind: str, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = request.getfixturevalue(kind)
+    assert main([str(path), "--compare", "--json", "-"]) == DONE
+    report = result(capsys)
+    assert (report["exact"], report["steps"], report["gaps"]) == (kind == "drive", COUNT, 0)
+    comparison = report["comparison"]
+    assert isinstance(comparison, list)
+    assert len(comparison) == (3 if kind == "drive" else 2)
+    for entry in comparison:
+        assert (entry["compared"], entry["differing"], entry["largest"], entry["first"]) == (COUNT, 0, 0.0, None)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [["--set", "slew_up_nmps=1599"], ["--set", "slip_target=0.01"], ["--strategy", "equal"]],
+)
+@pytest.mark.parametrize("kind", ["drive", "inputs"])
+def test_a_changed_gain_limit_or_strategy_is_caught(
+    kind: str, change: list[str], request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = request.getfixturevalue(kind)
+    assert main([str(path), "--compare", *change]) == DIFFERENT
+    text = capsys.readouterr().out
+    assert "/wheel_torque_command" in text
+    assert "first at message" in text
+
+
+def test_a_changed_limit_of_the_vehicle_is_caught(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = share_path("config/vehicles/jalalmaab_2015.yaml").read_text()
+    changed = tmp_path / "weaker.yaml"
+    assert "regeneration_torque_nm" in text
+    lines = [
+        line.replace("80", "20", 1) if line.strip().startswith("regeneration_torque_nm") else line
+        for line in text.splitlines()
+    ]
+    changed.write_text("\n".join(lines) + "\n")
+    assert changed.read_text() != text
+    assert main([str(drive), "--compare", "--vehicle", str(changed)]) == DIFFERENT
+    assert "friction_brake_command" in capsys.readouterr().out
+
+
+POLICY = "jalalmaab_2015_drag_coupled_mu090.npz"
+
+
+def changed_policies(folder: Path) -> dict[str, list[str]]:
+    """Arguments for `replay` that stand for the recorded policy and for four others."""
+    policy = load_policy(share_path(f"policies/{POLICY}"))
+    nudged = dataclasses.replace(policy, front_share=np.clip(policy.front_share + 0.01, 0.0, 1.0))
+    save_policy(nudged, folder / "nudged.npz")
+    return {
+        "the same": [],
+        "the same file, copied": ["--policy", str(share_path(f"policies/{POLICY}"))],
+        "another friction": ["--friction", "0.2"],
+        "another file": ["--policy", str(share_path(f"policies/{POLICY}".replace("mu090", "mu050")))],
+        "a table 0.01 off": ["--policy", str(folder / "nudged.npz")],
+    }
+
+
+@pytest.mark.parametrize("state", [True, False], ids=["drive", "inputs"])
+def test_a_changed_policy_is_caught_and_the_same_one_matches(
+    state: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Long enough for the policies of friction 0.9 and 0.5, which are much alike, to disagree.
+    drive = ScriptedDrive("sdp", share_path("policies")).write(tmp_path / "drive", 2 * COUNT, state=state)
+    for name, arguments in changed_policies(tmp_path).items():
+        wanted = DONE if name.startswith("the same") else DIFFERENT
+        assert main([str(drive), "--compare", *arguments]) == wanted, name
+        text = capsys.readouterr().out
+        assert ("first at message" in text) == (wanted == DIFFERENT), name
+
+
+def test_a_policy_changed_in_its_place_is_caught(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "policy.npz"
+    policy = load_policy(share_path(f"policies/{POLICY}"))
+    save_policy(policy, file)
+    drive = ScriptedDrive("sdp", file).write(tmp_path / "drive", COUNT)
+    assert main([str(drive), "--compare"]) == DONE
+    save_policy(dataclasses.replace(policy, front_share=1.0 - policy.front_share), file)
+    assert main([str(drive), "--compare"]) == DIFFERENT
+    assert "first at message" in capsys.readouterr().out
+
+
+def test_another_policy_that_decides_the_same_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "policy.npz"
+    policy = load_policy(share_path(f"policies/{POLICY}"))
+    save_policy(policy, file)
+    drive = ScriptedDrive("sdp", file).write(tmp_path / "drive", 20, policy_sha256=content_sha256(file))
+    assert main([str(drive), "--compare"]) == DONE
+    assert "not the one that was recorded" not in capsys.readouterr().out
+    save_policy(dataclasses.replace(policy, package_version="0"), file)
+    assert main([str(drive), "--compare"]) == DONE
+    assert "the policy is not the one that was recorded" in capsys.readouterr().out
+
+
+def test_a_difference_within_the_tolerance_is_none(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(drive), "--compare", "--set", "slew_up_nmps=1599", "--tolerance", "1e9"]) == DONE
+    assert "/wheel_torque_command" in capsys.readouterr().out
+
+
+def test_the_output_holds_the_inputs_as_recorded_and_the_same_bytes_every_time(drive: Path, tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        assert main([str(drive), "--output", str(tmp_path / name / "out"), "--strategy", "equal"]) == DONE
+    first, second = ({f.name: f.read_bytes() for f in (tmp_path / n / "out").iterdir()} for n in ("one", "two"))
+    assert first == second
+    with BagReader(drive) as recorded, BagReader(tmp_path / "one" / "out") as replayed:
+        assert replayed.custom_data["replay_strategy"] == "equal"
+        before, after = list(recorded.messages()), list(replayed.messages())
+    inputs = ("/vehicle_speed", "/wheel_states", "/battery_state", "/power_demand")
+    assert [m for m in after if m.topic in inputs] == [m for m in before if m.topic in inputs]
+    assert len(after) == len(before)
+    with AnyReader([tmp_path / "one" / "out"]) as reader:
+        torques = [
+            reader.deserialize(data, c.msgtype).effort
+            for c, _, data in reader.messages()
+            if c.topic == "/wheel_torque_command"
+        ]
+    assert any(abs(t[0]) > 1.0 for t in torques)
+
+
+def test_a_replayed_bag_replays_exactly_itself(drive: Path, tmp_path: Path) -> None:
+    assert main([str(drive), "--output", str(tmp_path / "equal"), "--strategy", "equal"]) == DONE
+    assert main([str(tmp_path / "equal"), "--compare"]) == DONE
+
+
+def test_missing_steps_are_reported_because_the_memory_of_the_law_is_then_unknown(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = "/power_manager/state"
+    with BagReader(drive) as source, BagWriter(tmp_path / "gap") as bag:
+        numbers = {name: bag.add_topic(topic) for name, topic in source.topics.items()}
+        for message in source.messages():
+            if not (message.topic == state and 40 <= message.sequence < 43):
+                bag.write(numbers[message.topic], message.log_time_ns, message.data)
+    main([str(tmp_path / "gap"), "--compare"])
+    text = capsys.readouterr().out
+    assert "1 time(s) steps before are not in the bag" in text
+    assert "without counterpart: 3 recorded, 0 recomputed" in text
+
+
+def test_two_activations_in_one_bag_are_both_repeated_from_their_first_step(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    second = ScriptedDrive(STRATEGY).write(tmp_path / "second", 50, start=COUNT)
+    with BagWriter(tmp_path / "both") as bag:
+        numbers: dict[str, int] = {}
+        for path in (drive, second):
+            with BagReader(path) as source:
+                for name, described in source.topics.items():
+                    numbers.setdefault(name, bag.add_topic(described) if name not in numbers else 0)
+                for message in source.messages():
+                    bag.write(numbers[message.topic], message.log_time_ns, message.data)
+    assert main([str(tmp_path / "both"), "--compare"]) == DONE
+    assert f"{COUNT + 50} steps" in capsys.readouterr().out
+
+
+def test_a_repeated_answer_is_compared_but_not_stepped_twice(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagReader(drive) as source, BagWriter(tmp_path / "twice") as bag:
+        numbers = {name: bag.add_topic(topic) for name, topic in source.topics.items()}
+        for message in source.messages():
+            for _ in range(2 if message.sequence == 60 else 1):
+                bag.write(numbers[message.topic], message.log_time_ns, message.data)
+    assert main([str(tmp_path / "twice"), "--compare"]) == DONE
+    assert f" {COUNT + 1} " in capsys.readouterr().out  # compared once more, and equal
+
+
+def test_bad_messages_are_counted_and_skipped(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with BagReader(drive) as source, BagWriter(tmp_path / "bad") as bag:
+        numbers = {name: bag.add_topic(topic) for name, topic in source.topics.items()}
+        for message in source.messages():
+            bag.write(numbers[message.topic], message.log_time_ns, message.data)
+            if message.sequence == 70 and message.topic in ("/power_manager/state", "/wheel_torque_command"):
+                bag.write(numbers[message.topic], message.log_time_ns, b"\0\1\0\0\1\2")
+    assert main([str(tmp_path / "bad"), "--compare"]) == DONE
+    assert "2 bad messages skipped" in capsys.readouterr().out
+
+
+def test_a_damaged_bag_is_replayed_as_far_as_it_goes(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "cut.mcap"
+    with BagReader(drive) as source, BagWriter(tmp_path / "small") as bag:
+        numbers = {name: bag.add_topic(topic) for name, topic in source.topics.items()}
+        for i, message in enumerate(source.messages()):
+            bag.write(numbers[message.topic], message.log_time_ns, message.data)
+            if i % 70 == 69:
+                bag.flush()
+    content = (tmp_path / "small" / "small_0.mcap").read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    assert main([str(path), "--compare"]) == DONE
+    text = capsys.readouterr().out
+    assert "damaged: " in text
+    assert "repeated from the recorded state" in text
+
+
+def foreign_bag(path: Path, count: int) -> Path:
+    """Another car: odometry, wheels in rpm by other names, demand in kW as Float32; sqlite3, 50 Hz, no lock-step."""
+    script = ScriptedDrive(STRATEGY)
+    types = typestore().types
+    stamp_type, header_type = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+    with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        odometry = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=typestore())
+        wheels = writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=typestore())
+        demand = writer.add_connection("/demand", "std_msgs/msg/Float32", typestore=typestore())
+        for i in range(count):
+            now = i * 20_000_000
+            stamp = stamp_type(now // 10**9, now % 10**9)
+            header = header_type(stamp, "odom")
+            speed, radps, watts = script.inputs(2 * i)
+            vector, point = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Point"](0, 0, 0)
+            twist_type = types["geometry_msgs/msg/Twist"](vector(speed, 0, 0), vector(0, 0, 0))
+            pose = types["geometry_msgs/msg/Pose"](point, types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1))
+            matrix = np.zeros(36)
+            message = types["nav_msgs/msg/Odometry"](
+                header,
+                "base",
+                types["geometry_msgs/msg/PoseWithCovariance"](pose, matrix),
+                types["geometry_msgs/msg/TwistWithCovariance"](twist_type, matrix),
+            )
+            rpm = np.array([radps[k] for k in (3, 0, 2, 1)]) * 30.0 / np.pi
+            joint = types["sensor_msgs/msg/JointState"](header, ["d", "a", "c", "b"], np.zeros(0), rpm, np.zeros(0))
+            writer.write(odometry, now + 3_000_000, typestore().serialize_cdr(message, "nav_msgs/msg/Odometry"))
+            writer.write(
+                demand,
+                now + 4_000_000,
+                typestore().serialize_cdr(types["std_msgs/msg/Float32"](watts / 1000.0), "std_msgs/msg/Float32"),
+            )
+            writer.write(wheels, now + 5_000_000, typestore().serialize_cdr(joint, "sensor_msgs/msg/JointState"))
+    return path
+
+
+def test_another_cars_bag_is_replayed_through_a_mapping(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = foreign_bag(tmp_path / "foreign", 60)
+    mapping = tmp_path / "mapping.yaml"
+    mapping.write_text(
+        "signals:\n  speed: {topic: /odom, field: twist.twist.linear.x, unit: m/s}\n"
+        "  wheel_speed: {topic: /joint_states, field: velocity, unit: rpm, names: [a, b, c, d]}\n"
+        "  power_demand: {topic: /demand, field: data, unit: kW}\n"
+    )
+    arguments = [str(path), "--mapping", str(mapping), "--strategy", STRATEGY, "--output", str(tmp_path / "out")]
+    assert main([*arguments, "--json", "-"]) == DONE
+    report = result(capsys)
+    assert (report["exact"], report["steps"], report["bad_messages"], report["dropped"]) == (False, 60, 0, {})
+    assert report["comparison"] == []
+    with BagReader(tmp_path / "out") as reader:
+        assert set(reader.topics) == {
+            "/odom", "/joint_states", "/demand",
+            "/wheel_torque_command", "/friction_brake_command", "/power_manager/state",
+        }  # fmt: skip
+        assert reader.counts["/wheel_torque_command"] == 60
+    assert main([str(tmp_path / "out"), "--compare"]) == DONE  # its own state repeats it exactly
+
+
+def test_a_pause_in_the_inputs_starts_the_law_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    script = ScriptedDrive(STRATEGY)
+    with BagWriter(tmp_path / "bag") as bag:
+        from bags_helpers import JointStateEncoder
+
+        speed, demand = bag.add_topic(topic("/vehicle_speed", TWIST)), bag.add_topic(topic("/power_demand"))
+        wheels = bag.add_topic(topic("/wheel_states", "sensor_msgs/msg/JointState"))
+        encode = JointStateEncoder(("front_left", "front_right", "rear_left", "rear_right"), "velocity")
+        for i in range(60):
+            now = i * 10_000_000 + (5_000_000_000 if i >= 30 else 0)
+            metres, radps, watts = script.inputs(i)
+            bag.write(speed, now, twist(now, metres))
+            bag.write(demand, now + 1, float64(watts))
+            bag.write(wheels, now + 2, encode(now, radps))
+    assert main([str(tmp_path / "bag"), "--strategy", "equal", "--json", "-"]) == DONE
+    report = result(capsys)
+    assert report["restarts"] == 1
+    assert report["steps"] == 59  # the first wheel speed after the pause had no speed and demand to go with it
+
+
+def test_what_if_shows_the_recorded_energy_and_that_of_each_strategy(
+    drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(drive), "--what-if", "jalalmaab_2015", "--strategy", "equal", STRATEGY, "--json", "-"]
+    assert main(arguments) == DONE
+    rows = {row["label"]: row for row in result(capsys)["rows"]}  # type: ignore[attr-defined, index]
+    assert list(rows) == ["recorded", "equal", STRATEGY]
+    assert rows["recorded"] == {**rows[STRATEGY], "label": "recorded"}
+    assert rows["equal"]["chemical_wh"] != rows["recorded"]["chemical_wh"]
+    assert rows["equal"]["distance_m"] == rows["recorded"]["distance_m"] > 1.0
+    assert rows["equal"]["idle_drag_wh"] < rows["recorded"]["idle_drag_wh"]
+
+
+def test_energy_of_a_constant_step_is_power_times_time(drive: Path) -> None:
+    from iwm_power_manager.control.types import Measurement
+    from iwm_power_manager.model.motor import electrical_power_w
+    from iwm_power_manager.replay.what_if import EnergyMeter
+
+    car = ScriptedDrive("equal").vehicle.params
+    meter = EnergyMeter("x", car)
+    measurement = Measurement(10.0, (30.0,) * 4, 0.0, 0.5, 0.9, 1e5, 1e5, 0.7)
+    for _ in range(8):
+        meter.add(measurement, (20.0,) * 4, (0.0, 0.0, -1.0, -1.0))
+    found = meter.result()
+    assert found.distance_m == pytest.approx(40.0)
+    assert found.electrical_wh == pytest.approx(4 * electrical_power_w(20.0, 30.0, car.motor) * 4.0 / 3600.0)
+    assert found.chemical_wh > found.electrical_wh
+    assert found.friction_wh == pytest.approx(-2 * 30.0 * 4.0 / 3600.0)
+    assert found.wheel_work_wh == pytest.approx((4 * 20.0 - 2.0) * 30.0 * 4.0 / 3600.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["/none"], "/none: does not exist"),
+        (["{drive}", "--strategy", "best"], "--strategy: 'best' cannot be replayed; allowed: equal | "),
+        (["{drive}", "--strategy", "preview"], "--strategy: 'preview' cannot be replayed"),
+        (["{drive}", "--strategy", "sdp", "--policy", "/none.npz"], "/none.npz"),
+        (["{drive}", "--strategy", "sdp", "--policy", ""], "the strategy needs a policy"),
+        (["{drive}", "--set", "gain=1"], "--set: gain: is no setting of the law; allowed: decision_period_s"),
+        (["{drive}", "--set", "critical_slip=x"], "--set: critical_slip"),
+        (["{drive}", "--set", "gate_mode=x"], "--set: gate_mode: 'x' is unknown; allowed: off | table2 | limiter"),
+        (["{drive}", "--set", "gate_driving=1"], "--set: gate_driving: '1' is neither true nor false"),
+        (["{drive}", "--vehicle", "/none.yaml"], "/none.yaml"),
+        (["{drive}", "--mapping", "/none.yaml"], "/none.yaml"),
+        (["{drive}", "--friction", "7"], "--friction"),
+        (["{drive}", "--tolerance", "-1"], "--tolerance"),
+        (["{drive}", "--publish", "--compare"], "--publish: excludes"),
+        (["{drive}", "--what-if", "jalalmaab_2015", "--compare"], "--what-if: excludes"),
+        (["{drive}", "--strategy", "equal", "sdp"], "--strategy: several make sense with --what-if only"),
+        (["{drive}", "--publish", "--start", "3", "--end", "2"], "--end"),
+        (["{drive}", "--output", "{drive}"], "exists already and is not overwritten"),
+    ],
+)
+def test_a_mistake_gets_one_line_and_exit_code_2(
+    arguments: list[str], line: str, drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([argument.replace("{drive}", str(drive)) for argument in arguments]) == BAD_INPUT
+    error = capsys.readouterr().err
+    assert line in error
+    assert error.startswith("replay: ")
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_a_bag_without_wheel_speeds_or_steps_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        speed, demand = bag.add_topic(topic("/vehicle_speed", TWIST)), bag.add_topic(topic("/power_demand"))
+        bag.write(speed, 1, twist(1, 1.0))
+        bag.write(demand, 2, float64(1.0))
+    assert main([str(tmp_path / "bag"), "--strategy", "equal"]) == BAD_INPUT
+    assert "maps to wheel_speed" in capsys.readouterr().err
+
+
+def test_a_replay_that_fails_leaves_nothing_in_the_way(drive: Path, tmp_path: Path) -> None:
+    arguments = [str(drive), "--output", str(tmp_path / "out")]
+    assert main([*arguments, "--strategy", "sdp", "--policy", "/none.npz"]) == BAD_INPUT
+    assert not (tmp_path / "out").exists()
+    assert main([*arguments, "--output", str(drive)]) == BAD_INPUT  # what is not ours stays
+    assert (drive / "metadata.yaml").exists()
+    assert main(arguments) == DONE
+
+
+def test_a_bag_whose_inputs_never_come_together_gives_no_step(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from bags_helpers import JointStateEncoder
+
+    with BagWriter(tmp_path / "bag") as bag:
+        speed, demand = bag.add_topic(topic("/vehicle_speed", TWIST)), bag.add_topic(topic("/power_demand"))
+        wheels = bag.add_topic(topic("/wheel_states", "sensor_msgs/msg/JointState"))
+        encode = JointStateEncoder(("front_left", "front_right", "rear_left", "rear_right"), "velocity")
+        bag.write(wheels, 1, encode(1, (1.0, 1.0, 1.0, 1.0)))
+        bag.write(speed, 2, twist(2, 1.0))
+        bag.write(demand, 3, float64(1.0))
+    assert main([str(tmp_path / "bag"), "--strategy", "equal", "--output", str(tmp_path / "out")]) == BAD_INPUT
+    assert "gave no control step" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_plan_comes_from_the_options_else_from_the_bag_else_from_the_package() -> None:
+    parameters = {"strategy": "rule", "rule": [1.0, 0.25, 0.0, 0.5], "friction": 0.4, "critical_slip": 0.1,
+                  "gate_mode": "table2", "rate_hz": 50.0, "idle_drive": "none"}  # fmt: skip
+    custom = {"parameters /car/power_manager": json.dumps(parameters), "parameters /other": "{}"}
+    plan = make_plan(Choice(), custom)
+    assert plan.settings == default_settings("rule")._replace(critical_slip=0.1, gate_mode=1)
+    assert (plan.friction, plan.keeps_friction, plan.period_s) == (0.4, True, 0.02)
+    assert plan.vehicle.idle_drive == "none"
+    assert plan.policies.table(plan.settings.strategy, 0.4).rule.tolist() == [1.0, 0.25, 0.0, 0.5]
+    plan = make_plan(Choice(strategy="equal", friction=0.7, settings=("critical_slip=0.3",)), custom)
+    assert plan.changes == {"strategy": default_settings("equal").strategy, "critical_slip": 0.3}
+    assert (plan.friction, plan.keeps_friction) == (0.7, False)
+    assert make_plan(Choice(strategy="equal"), {}).settings == default_settings("equal")
+    assert recorded_parameters({"parameters /power_manager": "not json"}) == {}
+
+
+def test_a_policy_for_another_car_is_refused(tmp_path: Path) -> None:
+    with pytest.raises((PolicyError, ConfigError)):
+        make_plan(Choice(policy=str(tmp_path)), {}).policies.table(default_settings("sdp").strategy, 0.9)
+
+
+def test_a_comparison_tells_largest_rms_first_and_what_has_no_counterpart() -> None:
+    comparer = TopicComparer("/t", 0.5)
+    nan = float("nan")
+    comparer.recorded(1, 101, ("a", "b"), (1.0, 2.0))
+    comparer.recomputed(1, 0, ("a", "b"), (1.0, 2.25))  # within the tolerance
+    comparer.recomputed(2, 0, ("a", "b"), (4.0, 2.0))  # recomputed may come first
+    comparer.recorded(2, 102, ("b", "a"), (2.0, 1.0))  # and names in another order
+    comparer.recorded(3, 103, ("a", "b"), (nan, nan))
+    comparer.recomputed(3, 0, ("a", "b"), (nan, nan))
+    comparer.recorded(4, 104, ("a", "b"), (0.0, 0.0))
+    comparer.recomputed(5, 0, ("a", "b"), (0.0, 0.0))
+    found = comparer.result()
+    assert (found.compared, found.differing, found.largest, found.worst) == (3, 1, 3.0, "a")
+    assert found.rms == pytest.approx(np.sqrt((0.25**2 + 9.0) / 6.0))
+    assert (found.only_recorded, found.only_recomputed) == (1, 1)
+    assert found.first is not None
+    assert found.first._asdict() == {
+        "message": 1, "stamp_ns": 2, "log_time_ns": 102, "name": "a", "recorded": 1.0, "recomputed": 4.0,
+    }  # fmt: skip
+    comparer.recorded(6, 106, ("a",), (0.0,))
+    comparer.recomputed(6, 0, ("a", "b"), (0.0, 1.0))  # a value the record lacks
+    assert comparer.result().largest == np.inf
+
+
+def test_a_state_of_another_version_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from bags_helpers import JointStateEncoder
+
+    with BagWriter(tmp_path / "bag") as bag:
+        number = bag.add_topic(topic("/power_manager/state", "sensor_msgs/msg/JointState"))
+        bag.write(number, 1, JointStateEncoder(("speed_mps",), "position")(1, (2.0,)))
+    assert main([str(tmp_path / "bag"), "--compare"]) == BAD_INPUT
+    assert "lacks the signal 'step': recorded by another version" in capsys.readouterr().err
+
+
+def test_progress_is_called_with_messages_and_time(drive: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    with BagReader(drive) as bag:
+        replay = Replay(bag, make_plan(Choice(strategy="equal"), bag.custom_data), load_mapping())
+        from iwm_power_manager.replay import run as module
+
+        every = module._PROGRESS_EVERY
+        module._PROGRESS_EVERY = 100
+        try:
+            for _ in replay.steps(lambda messages, log_time_ns: seen.append((messages, log_time_ns))):
+                pass
+        finally:
+            module._PROGRESS_EVERY = every
+    assert [messages for messages, _ in seen] == list(range(100, COUNT * 7 + 1, 100))
+    assert [time for _, time in seen] == sorted(time for _, time in seen)

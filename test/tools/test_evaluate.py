@@ -1,0 +1,130 @@
+"""The command `evaluate`, as a user calls it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from iwm_sim.tools import evaluate
+
+ROOT = Path(__file__).resolve().parents[2]
+VEHICLE = "jalalmaab_2015"
+
+
+def rows_of(path):
+    return json.loads(Path(path).read_text())["rows"]
+
+
+def test_two_strategies_on_a_cycle_give_a_table_and_rows(hill, small_policy, tmp_path, capsys):
+    out = tmp_path / "out.json"
+    arguments = ["--cycle", str(hill), "--friction", "0.9", "--strategy", "sdp", "--idle-drive", "none"]
+    code = evaluate.main([*arguments, "--policy", str(small_policy), "--json", str(out), "--jobs", "1"])
+    assert code == 0
+    shown = capsys.readouterr().out
+    assert "hill, friction 0.9, idle drive none" in shown
+    equal, sdp = rows_of(out)
+    assert (equal["strategy"], sdp["strategy"]) == ("equal", "sdp")
+    assert f"{sdp['wh_per_km']:.2f}" in shown
+    assert set(sdp) >= {
+        *("cycle", "friction", "strategy", "idle_drive", "delta_soc_percent", "wh_per_km", "distance_m"),
+        *("rms_speed_error_mps", "max_speed_error_mps", "trace_held", "min_slip", "max_slip", "locked_s"),
+        *("share_changes_per_min", "saving_percent", "share_of_possible"),
+        *("settings", "vehicle_hash", "policy_checksum"),
+    }
+    assert sdp["trace_held"] is True
+    assert equal["policy_checksum"] is None
+
+
+def test_all_combinations_are_driven_and_short_names_resolve(tmp_path):
+    out = tmp_path / "out.json"
+    cycle = tmp_path / "creep.csv"
+    cycle.write_text("time_s,speed_mps,grade\n0,0,0\n2,2,0.02\n6,2,0.02\n8,0,0\n")
+    arguments = ["--vehicle", VEHICLE, "--cycle", str(cycle), "--friction", "0.9", "0.5"]
+    assert (
+        evaluate.main(
+            [*arguments, "--idle-drive", "none", "drag", "--strategy", "instantaneous", "--json", str(out), "--quiet"]
+        )
+        == 0
+    )
+    seen = [(row["friction"], row["idle_drive"], row["strategy"]) for row in rows_of(out)]
+    assert len(seen) == len(set(seen)) == 8
+
+
+def test_law_settings_reach_the_law(hill, tmp_path):
+    out = tmp_path / "out.json"
+    law = ["--gate-mode", "table2", "--no-gate-driving", "--switching-power", "5", "--critical-slip", "0.1"]
+    arguments = ["--cycle", str(hill), "--strategy", "instantaneous_slip", "--assumed-friction", "0.5", "--jobs", "1"]
+    run = ["--dt", "0.02", "--initial-soc", "0.5", "--noise", "0.1", "0.3", "--seed", "3"]
+    assert evaluate.main([*arguments, *law, *run, "--json", str(out), "--quiet"]) == 0
+    row = rows_of(out)[1]
+    settings = row["settings"]
+    assert (settings["gate_mode"], settings["gate_driving"], settings["gate_hysteresis"]) == (1, False, 0.0)
+    assert (settings["switching_power_w"], settings["critical_slip"]) == (5.0, 0.1)
+    assert settings["slip_target"] < settings["critical_slip"]
+    assert (row["assumed_friction"], row["dt_s"], row["initial_soc"]) == (0.5, 0.02, 0.5)
+    assert row["noise"] == {"speed_mps": 0.1, "wheel_radps": 0.3, "seed": 3}
+
+
+def test_series_are_saved_with_an_array_for_each_signal(hill, tmp_path):
+    folder = tmp_path / "series"
+    arguments = ["--cycle", str(hill), "--strategy", "equal", "--idle-drive", "drag", "--save-series", str(folder)]
+    assert evaluate.main([*arguments, "--quiet"]) == 0
+    with np.load(folder / "hill_drag_mu090_equal.npz") as series:
+        assert series["speed_mps"].max() == pytest.approx(10.0, abs=0.2)
+        assert len(series["time_s"]) == len(series["soc"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "--cycle: is missing"),
+        (["--cycle", "no_such_cycle"], "no_such_cycle: cannot be read"),
+        (["--cycle", "nycc", "--vehicle", "no_such_car"], "no_such_car: cannot be read"),
+        (["--cycle", "nycc", "--policy", "no_such_folder"], "neither a policy file nor a folder"),
+        (["--cycle", "nycc", "--strategy", "preview", "--switching-cost", "1", "--dt", "0.013"], "does not divide"),
+        (["--cycle", "nycc", "--strategy", "equal", "--save-series", "/dev/null/x"], "cannot be created"),
+        (["--fit-battery", "--cycle", "nycc", "--plot", "picture.txt"], "is no picture's name"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(arguments, words, capsys):
+    assert evaluate.main(arguments) == 2
+    captured = capsys.readouterr()
+    errors = [line for line in captured.err.splitlines() if line.startswith("evaluate: error")]
+    assert len(errors) == 1
+    assert words in errors[0]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--friction", "3"], ["--friction", "nan"], ["--dt", "1"], ["--jobs", "0"], ["--strategy", "magic"]]
+)
+def test_a_value_out_of_range_is_refused_with_its_range(arguments, capsys):
+    with pytest.raises(SystemExit) as ended:
+        evaluate.main(["--cycle", "nycc", *arguments])
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert "allowed" in error or "choose from" in error
+
+
+def test_the_command_runs_as_a_process_on_all_cores(hill, tmp_path):
+    out = tmp_path / "out.json"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "iwm_sim.tools.evaluate", "--cycle", str(hill), "--json", str(out), "--jobs", "2"]
+    made = subprocess.run(
+        [*command, "--strategy", "equal", "instantaneous"], env=environment, capture_output=True, text=True, check=False
+    )
+    assert made.returncode == 0, made.stderr
+    assert len(rows_of(out)) == 2
+    assert "Traceback" not in made.stderr
+
+
+def test_the_battery_fit_prints_its_estimates_and_draws(hill, tmp_path, capsys):
+    picture, out = tmp_path / "fit.svg", tmp_path / "fit.json"
+    arguments = ["--fit-battery", "--cycle", str(hill), "--plot", str(picture), "--json", str(out)]
+    assert evaluate.main(arguments) == 0
+    assert "0.063 ohm" in capsys.readouterr().out
+    assert picture.read_text().lstrip().startswith("<?xml")
+    assert json.loads(out.read_text())["plant"]["resistance_ohm"] > 0.0

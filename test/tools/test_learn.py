@@ -1,0 +1,245 @@
+"""`learn_policy`: what is recorded is tried at several weights, and only what drives no worse is kept."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bags_helpers import write_drive
+from iwm_power_manager.control.types import default_settings
+from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.mdp.demand import Source
+from iwm_power_manager.mdp.problem import load_problem
+from iwm_power_manager.policy import empty_table, load_policy
+from iwm_power_manager.share import share_path
+from iwm_power_manager.signals.recorded import RecordedDrive
+from iwm_power_manager.tools import solve_policy
+from iwm_power_manager.vehicle import load_vehicle
+from iwm_sim import closed_loop
+from iwm_sim.metrics import measure
+from iwm_sim.tools import learn
+from iwm_sim.tools.learn import CYCLES_ALONE, RECORDING_ALONE, Candidate, Outcome, choose, recorded_cycle, sources_at
+
+CAR = "jalalmaab_2015"
+
+
+def outcome(weight: float, energy: float, moves: float = 0.0, held: bool = True) -> Outcome:
+    return Outcome(Candidate(weight, 1.0, 1.0), energy, moves, 5.0, held)
+
+
+class TestChoose:
+    def test_the_least_cost_moves_included(self) -> None:
+        best = outcome(2.0, 99.0, 0.5)
+        assert choose([outcome(CYCLES_ALONE, 100.0), outcome(1.0, 98.0, 1.8), best, outcome(3.0, 99.8)]) is best
+
+    def test_fewer_moves_are_no_reason_to_need_more_energy(self) -> None:
+        cycles, frugal = outcome(CYCLES_ALONE, 100.0, 2.0), outcome(1.0, 100.0, 1.9)
+        assert choose([cycles, outcome(2.0, 100.01, 0.1), frugal]) is frugal
+        assert choose([cycles, outcome(2.0, 100.01, 0.1)]) is cycles
+
+    def test_the_cycles_where_nothing_is_better(self) -> None:
+        cycles = outcome(CYCLES_ALONE, 100.0)
+        assert choose([outcome(1.0, 100.0), cycles, outcome(2.0, 99.0, 1.5)]) is cycles
+
+    def test_a_lost_trace_is_no_saving(self) -> None:
+        cycles, honest = outcome(CYCLES_ALONE, 100.0), outcome(2.0, 99.9)
+        lost = outcome(1.0, 90.0, held=False)
+        assert choose([cycles, lost, honest]) is honest
+        assert choose([cycles, lost]) is cycles
+
+    def test_a_trace_that_nobody_holds_is_no_reason(self) -> None:
+        better = outcome(1.0, 90.0, held=False)
+        assert choose([outcome(CYCLES_ALONE, 100.0, held=False), better]) is better
+
+
+class TestRecordedCycle:
+    def test_a_point_a_second_with_the_mean_around_it(self) -> None:
+        time_s = np.arange(0.0, 10.001, 0.01)
+        noise = 0.2 * np.cos(2 * math.pi * 5.0 * time_s)
+        drive = RecordedDrive(time_s + 100.0, np.zeros_like(time_s), 2.0 * time_s + noise, 0, ())
+        cycle = recorded_cycle("drive", drive)
+        assert cycle.time_s.tolist() == list(range(11))
+        assert cycle.speed_mps[1:-1] == pytest.approx(2.0 * np.arange(1, 10), abs=0.01)
+        assert cycle.speed_mps[0] == pytest.approx(0.5, abs=0.05)  # of the half second there is
+        assert cycle.name == "drive"
+
+    def test_it_rolls_forwards(self) -> None:
+        time_s = np.linspace(0.0, 5.0, 51)
+        cycle = recorded_cycle("drive", RecordedDrive(time_s, time_s, np.full(51, -0.3), 0, ()))
+        assert cycle.speed_mps.tolist() == [0.0] * 6
+
+    def test_too_short(self) -> None:
+        time_s = np.array([0.0, 1.9])
+        with pytest.raises(ConfigError, match=r"drive.*too short"):
+            recorded_cycle("drive", RecordedDrive(time_s, time_s, time_s, 0, ()))
+
+
+def test_no_two_candidates_share_a_file() -> None:
+    values = [
+        (0.2, 1.0, 1.0),
+        (0.2000001, 1.0, 1.0),
+        (0.2, 1.0000001, 1.0),
+        (0.2, 1.0, 1.3),
+        (RECORDING_ALONE, 1.0, 1.0),
+    ]
+    assert len({learn.policy_path("folder", Candidate(*each)) for each in values}) == len(values)
+
+
+def test_the_baseline_comes_first_and_once() -> None:
+    problem = load_problem(share_path("config/grids/coupled.yaml"))
+    found = learn.candidates_of(problem, (RECORDING_ALONE, 1.0, CYCLES_ALONE), (1.0, 0.9, 0.9), (1.3, 1.0))
+    assert found[0] == learn.BASELINE and len(found) == len(set(found)) == 3 * 2 * 2
+    assert [candidate.weight for candidate in found] == [0.0] * 4 + [1.0] * 4 + [RECORDING_ALONE] * 4
+    without_speed = dataclasses.replace(problem, demand_by_speed=False)
+    assert [each.bandwidth for each in learn.candidates_of(without_speed, (1.0,), (1.0,), (1.3, 2.0))] == [1.0, 1.0]
+
+
+def test_a_candidate_changes_price_and_bandwidth_and_nothing_else() -> None:
+    problem = load_problem(share_path("config/grids/coupled.yaml"))
+    varied = learn.varied(problem, Candidate(1.0, 0.5, 2.0))
+    assert varied.speed_bandwidth_mps == 2.0 * problem.speed_bandwidth_mps
+    for friction in (0.2, 0.5, 0.9, 0.7):
+        assert varied.on_road(friction).switching_cost_j == 0.5 * problem.on_road(friction).switching_cost_j
+    changed = {
+        field.name
+        for field in dataclasses.fields(problem)
+        if getattr(varied, field.name) is not getattr(problem, field.name)
+        and getattr(varied, field.name) != getattr(problem, field.name)
+    }
+    assert changed <= {"speed_bandwidth_mps", "switching_cost_j", "switching_cost_by_friction"}
+    assert varied.switching_cost_j == 0.5 * problem.switching_cost_j
+
+
+def test_weights_are_those_of_the_recording() -> None:
+    recorded = Source("bag", "", 1.0, (np.zeros(3),))
+    general = Source("cycle", "", 1.0, (np.zeros(3),))
+
+    def weights(weight: float) -> list[tuple[str, float]]:
+        return [(source.name, source.weight) for source in sources_at(weight, [recorded], [general])]
+
+    assert weights(CYCLES_ALONE) == [("cycle", 1.0)]
+    assert weights(RECORDING_ALONE) == [("bag", 1.0)]
+    assert weights(0.2) == [("bag", 0.2), ("cycle", 1.0)]
+
+
+def drive_nycc(folder: Path, friction: float, idle_drive: str) -> Path:
+    """A bag of the NYCC, driven with equal split."""
+    cycle = load_cycle(share_path("config/cycles/nycc.csv"))
+    car = load_vehicle(share_path(f"config/vehicles/{CAR}.yaml"), idle_drive)
+    drive = closed_loop.run(cycle, car, default_settings("equal"), empty_table(), friction)
+    path = folder / "nycc_drive"
+    write_drive(path, drive["speed_mps"], drive["power_demand_w"])
+    return path
+
+
+@pytest.fixture(scope="module")
+def nycc_bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """NYCC on a dry road."""
+    return drive_nycc(tmp_path_factory.mktemp("bags"), 0.9, "drag")
+
+
+def cost_of(policy_file: Path, friction: float, idle_drive: str) -> tuple[float, float]:
+    """Energy on the NYCC, and energy with the true price of moves, Wh/km."""
+    policy = load_policy(policy_file)
+    price_j = load_problem(share_path("config/grids/coupled.yaml")).on_road(friction).switching_cost_j
+    cycle = load_cycle(share_path("config/cycles/nycc.csv"))
+    car = load_vehicle(share_path(f"config/vehicles/{CAR}.yaml"), idle_drive)
+    run = closed_loop.run(cycle, car, default_settings("sdp_lookahead"), policy.table(), friction)
+    found = measure(run, car.params)
+    moves_j = price_j * np.abs(np.diff(run["decided_share"])).sum()
+    return found.wh_per_km, found.wh_per_km + moves_j / 3600.0 / (found.distance_m / 1000.0)
+
+
+def learned_and_general(bag: Path, folder: Path, friction: float, idle_drive: str, tried: list[str]) -> list[Path]:
+    """Policy files: from the bag, and from the three standard cycles."""
+    common = ["--vehicle", CAR, "--idle-drive", idle_drive, "--friction", str(friction), "--quiet"]
+    learned, general = folder / "learned.npz", folder / "general.npz"
+    numbers = ["--json", str(folder / "learn.json")]
+    trial = ["--bag", str(bag), "--drive", "nycc", *tried, "--jobs", "2", "--output", str(learned)]
+    assert learn.main([*common, *trial, *numbers]) == learn.DONE
+    cycles = [argument for name in ("ftp75", "hwfet", "nycc") for argument in ("--cycle", name)]
+    assert solve_policy.main([*common, *cycles, "--output", str(general)]) == solve_policy.SOLVED
+    return [learned, general]
+
+
+def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(nycc_bag: Path, tmp_path: Path) -> None:
+    tried = ["--weights", "1", "inf", "--prices", "0.9", "0.8", "--bandwidths", "1"]
+    learned, general = learned_and_general(nycc_bag, tmp_path, 0.2, "drag", tried)
+    energy, cost = cost_of(learned, 0.2, "drag")
+    general_energy, general_cost = cost_of(general, 0.2, "drag")
+    assert energy < general_energy and cost < general_cost
+    (road,) = json.loads((tmp_path / "learn.json").read_text())["roads"]
+    order = [(0.0, 1.0), (1.0, 0.8), (1.0, 0.9), ("inf", 0.8), ("inf", 0.9)]
+    assert [(row["weight"], row["price"]) for row in road["outcomes"]] == order
+    # What it was chosen for is what it does.
+    (chosen,) = (
+        row
+        for row in road["outcomes"]
+        if (row["weight"], row["price"]) == (road["chosen_weight"], road["chosen_price"])
+    )
+    assert (chosen["energy_wh_per_km"], chosen["cost_wh_per_km"]) == pytest.approx((energy, cost))
+    assert chosen["energy_wh_per_km"] < road["equal"]["energy_wh_per_km"]
+    assert (chosen["weight"], chosen["price"]) == ("inf", 0.9)
+    policy = load_policy(learned)
+    assert policy.checksum == road["checksum"]
+    assert policy.problem.switching_cost_j == pytest.approx(54.0 * 0.9)
+    assert [source["weight"] for source in policy.sources] == [1.0]
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("friction", [0.9, 0.5, 0.2])
+@pytest.mark.parametrize("idle_drive", ["none", "drag"])
+def test_what_its_nycc_taught_is_better_on_any_road(tmp_path: Path, friction: float, idle_drive: str) -> None:
+    bag = drive_nycc(tmp_path, friction, idle_drive)
+    learned, general = learned_and_general(bag, tmp_path, friction, idle_drive, [])
+    energy, cost = cost_of(learned, friction, idle_drive)
+    general_energy, general_cost = cost_of(general, friction, idle_drive)
+    assert energy <= general_energy and cost < general_cost
+    (road,) = json.loads((tmp_path / "learn.json").read_text())["roads"]
+    assert road["chosen_weight"] != CYCLES_ALONE
+
+
+class TestCommand:
+    def test_the_recorded_speed_is_what_is_driven(self, nycc_bag: Path, tmp_path: Path, capsys) -> None:
+        grid = tmp_path / "coarse.yaml"
+        grid.write_text(
+            "format: 1\npower_w: {from: -12000, to: 20000, step: 2000}\nspeed_mps: {from: 0, to: 30, step: 5}\n"
+            "slip_front: [0]\nslip_rear: [0]\nshare: {from: 0, to: 1, step: 0.25}\nprevious_share: true\n"
+            "slip_model: quasi_steady\ndt_s: 0.2\ndiscount: 0.95\nalpha: 5.0\nswitching_cost_j: 20\n"
+        )
+        arguments = ["--vehicle", CAR, "--bag", str(nycc_bag), "--cycle", "udds", "--grid", str(grid)]
+        arguments += ["--weights", "0.5", "--jobs", "1", "--friction", "0.9", "0.5", "--output", str(tmp_path / "out")]
+        assert learn.main(arguments) == learn.DONE
+        text = capsys.readouterr().out
+        assert "driven: nycc_drive (597 s)" in text or "driven: nycc_drive (598 s)" in text
+        assert text.count("<- chosen") == 2 and text.count("nothing: cycles alone") == 2
+        files = sorted((tmp_path / "out").iterdir())
+        assert [load_policy(file).friction for file in files] == [0.5, 0.9]
+
+    @pytest.mark.parametrize(
+        ("arguments", "said"),
+        [
+            (["--weights", "-0.1"], "--weights"),
+            (["--bandwidths", "0"], "--bandwidths"),
+            (["--weights", "nan"], "--weights"),
+            (["--prices", "0"], "--prices"),
+            (["--prices", "inf"], "--prices"),
+            (["--friction", "7"], "--friction"),
+            (["--bag", "no_such_bag"], "no_such_bag"),
+            (["--drive", "no_such_cycle"], "no_such_cycle"),
+        ],
+    )
+    def test_bad_input_is_one_line_and_leaves_nothing(
+        self, nycc_bag: Path, tmp_path: Path, capsys, arguments: list[str], said: str
+    ) -> None:
+        given = ["--vehicle", CAR, "--bag", str(nycc_bag), "--friction", "0.9", "--output", str(tmp_path / "p.npz")]
+        assert learn.main([*given, *arguments]) == learn.BAD_INPUT
+        captured = capsys.readouterr()
+        assert captured.out == "" and captured.err.startswith("learn_policy: error: ") and said in captured.err
+        assert list(tmp_path.iterdir()) == []
