@@ -9,10 +9,10 @@ from __future__ import annotations
 import argparse
 import sys
 
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import STRATEGIES, default_settings
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import IwmError
-from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import resolve, share_path
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.closed_loop import run

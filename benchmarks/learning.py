@@ -22,12 +22,12 @@ from pathlib import Path
 
 import numpy as np
 
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.demand import chain_of, signal_source, source_of
 from iwm_power_manager.mdp.problem import load_problem
-from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.solve_policy import solve_one
 from iwm_power_manager.vehicle import load_vehicle

@@ -1,8 +1,4 @@
-"""A car: its YAML file, checked value by value, and the frozen numbers the kernels take.
-
-The NamedTuples below are the whole interface between a vehicle file and the numerics: numba takes them as arguments,
-so that no parameter ever becomes a compiled-in constant. Field names carry their units; the file has the same names.
-"""
+"""A car: its YAML file, checked value by value, and the frozen numbers the kernels take."""
 
 from __future__ import annotations
 
@@ -15,129 +11,24 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from iwm_power_manager import files
 from iwm_power_manager.errors import ConfigError
-
-FloatArray = npt.NDArray[np.float64]
+from iwm_power_manager.model.parameters import (
+    IDLE_DRIVES,
+    Axle,
+    Battery,
+    Chassis,
+    Driver,
+    FloatArray,
+    FrictionBrake,
+    Motor,
+    Tyre,
+    VehicleParams,
+    Wheel,
+)
 
 FORMAT = 1
-
-#: What a motor at zero torque costs (docs/model.md, "Idle axle").
-IDLE_NONE, IDLE_DRAG, IDLE_ENABLED = range(3)
-IDLE_DRIVES: dict[str, int] = {"none": IDLE_NONE, "drag": IDLE_DRAG, "enabled": IDLE_ENABLED}
-
-
-class Chassis(NamedTuple):
-    """Body: road load (eq. 3-5) and load transfer (eq. 7, 8)."""
-
-    mass_kg: float
-    frontal_area_m2: float
-    drag_coefficient: float
-    rolling_resistance: float
-    air_density_kgpm3: float
-    front_axle_to_cg_m: float
-    rear_axle_to_cg_m: float
-    cg_height_m: float
-
-
-class Wheel(NamedTuple):
-    """One wheel with its rotor (eq. 11)."""
-
-    radius_m: float
-    inertia_kgm2: float
-
-
-class Tyre(NamedTuple):
-    """Magic Formula (eq. 9) and the regularisation of slip at rest (eq. 10)."""
-
-    stiffness_factor: float
-    shape_factor: float
-    peak_factor: float
-    curvature_factor: float
-    slip_speed_floor_mps: float
-
-
-class Motor(NamedTuple):
-    """One in-wheel motor with its inverter (eq. 14-16, 19, 42).
-
-    Losses come from the five coefficients, or, where `map_loss_w` is not empty, from the map: loss in W over
-    `map_speed_radps` (rows) and `map_torque_nm` (columns, from generating to driving).
-    """
-
-    max_power_w: float
-    peak_torque_nm: float
-    continuous_torque_nm: float
-    thermal_time_constant_s: float
-    regeneration_torque_nm: float
-    regeneration_full_above_mps: float
-    regeneration_zero_below_mps: float
-    loss_constant_w: float
-    loss_linear_speed: float
-    loss_quadratic_speed: float
-    loss_linear_torque: float
-    loss_quadratic_torque: float
-    idle_drive: int
-    idle_standby_w: float
-    idle_drag_constant_nm: float
-    idle_drag_linear_nm_per_radps: float
-    map_speed_radps: FloatArray
-    map_torque_nm: FloatArray
-    map_loss_w: FloatArray
-
-
-class FrictionBrake(NamedTuple):
-    """One friction brake (eq. 20, 41)."""
-
-    max_torque_nm: float
-
-
-class Battery(NamedTuple):
-    """Pack: the control model's static circuit (eq. 21-24) and the plant's richer one."""
-
-    cells_in_series: float
-    capacity_ah: float
-    nominal_cell_voltage_v: float
-    resistance_ohm: float
-    discharge_limit_w: float
-    charge_limit_w: float
-    charge_full_below_soc: float
-    charge_zero_above_soc: float
-    discharge_full_above_soc: float
-    discharge_zero_below_soc: float
-    charge_full_above_degc: float
-    charge_zero_below_degc: float
-    power_full_below_degc: float
-    power_zero_above_degc: float
-    ocv_soc: FloatArray
-    ocv_cell_v: FloatArray
-    ohmic_resistance_ohm: float
-    ohmic_factor_at_10_percent: float
-    polarisation_resistance_ohm: float
-    polarisation_time_constant_s: float
-
-
-class Driver(NamedTuple):
-    """The simulated driver and the meaning of the pedals."""
-
-    preview_s: float
-    proportional_n_per_mps: float
-    integral_n_per_m: float
-    full_brake_g: float
-    power_speed_floor_mps: float
-
-
-class VehicleParams(NamedTuple):
-    """The whole car as the kernels take it."""
-
-    chassis: Chassis
-    wheel: Wheel
-    tyre: Tyre
-    motor: Motor
-    friction_brake: FrictionBrake
-    battery: Battery
-    driver: Driver
 
 
 @dataclass(frozen=True)
@@ -298,12 +189,16 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
         if low > high or (low == high and not may_equal):
             relation = "at least" if may_equal else "more than"
             raise ConfigError(path, f"{section}.{large}", f"{high} is out of range", f"{relation} {small} = {low}")
-    params = VehicleParams(
-        chassis=Chassis(**numbers["chassis"]),
+    axle = Axle(
         wheel=Wheel(**numbers["wheel"]),
         tyre=Tyre(**numbers["tyre"]),
         motor=motor,
         friction_brake=FrictionBrake(**numbers["friction_brake"]),
+    )
+    params = VehicleParams(
+        chassis=Chassis(**numbers["chassis"]),
+        front=axle,
+        rear=axle,
         battery=battery,
         driver=Driver(**numbers["driver"]),
     )
@@ -314,7 +209,11 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
 def with_idle_drive(vehicle: Vehicle, idle_drive: str) -> Vehicle:
     """The same car with another `idle_drive`."""
     code = IDLE_DRIVES[files.check_choice("idle_drive", "idle_drive", idle_drive, IDLE_DRIVES)]
-    params = vehicle.params._replace(motor=vehicle.params.motor._replace(idle_drive=code))
+    params = vehicle.params
+    params = params._replace(
+        front=params.front._replace(motor=params.front.motor._replace(idle_drive=code)),
+        rear=params.rear._replace(motor=params.rear.motor._replace(idle_drive=code)),
+    )
     return dataclasses.replace(vehicle, idle_drive=idle_drive, params=params, hash=_hash(params))
 
 
@@ -480,11 +379,16 @@ def _hash(params: VehicleParams) -> str:
             return [float(x).hex() for x in value.ravel()]
         return float(value).hex() if isinstance(value, float) else value
 
-    content = {
-        section: {field: plain(value) for field, value in getattr(params, section)._asdict().items()}
-        for section in params._fields
-        if section != "driver"
+    def section(values: Any) -> dict[str, Any]:
+        return {field: plain(value) for field, value in values._asdict().items()}
+
+    content: dict[str, Any] = {"chassis": section(params.chassis), "battery": section(params.battery)}
+    axles = {
+        name: {part: section(values) for part, values in axle._asdict().items()}
+        for name, axle in (("front", params.front), ("rear", params.rear))
     }
+    # Equal axles count once, so that a car written with one section for both keeps its identity.
+    content |= axles["front"] if axles["front"] == axles["rear"] else axles
     content["driver"] = {"power_speed_floor_mps": plain(params.driver.power_speed_floor_mps)}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 

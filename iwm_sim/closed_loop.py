@@ -13,14 +13,15 @@ import numpy as np
 import numpy.typing as npt
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import ControllerState, Measurement, Settings, initial_state
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.driver import DriverState, Trace, drive, sample
 from iwm_power_manager.model.limits import battery_limits_w
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.tyre import slip_ratio
-from iwm_power_manager.policy import PolicyTable
-from iwm_power_manager.vehicle import Vehicle, VehicleParams
+from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import plant
 
 FloatArray = npt.NDArray[np.float64]
@@ -191,8 +192,8 @@ def _loop(
 ) -> plant.PlantState:
     road = (friction, friction, friction, friction)
     foot = DriverState(0.0)
-    radius = truth.wheel.radius_m
-    floor = truth.tyre.slip_speed_floor_mps
+    radius = truth.front.wheel.radius_m
+    floor = truth.front.tyre.slip_speed_floor_mps
     for k in range(trace.speed_mps.size):
         speed_error = 0.0
         wheel_error = (0.0, 0.0, 0.0, 0.0)

@@ -158,7 +158,7 @@ class Drive:
             self._substeps,
             self._params,
         )
-        radius, floor = self._params.wheel.radius_m, self._params.tyre.slip_speed_floor_mps
+        radius, floor = self._params.front.wheel.radius_m, self._params.front.tyre.slip_speed_floor_mps
         front_wheel, rear_wheel = before.wheel_speed_radps[0], before.wheel_speed_radps[2]
         self._series[k, _CAR_INDICES] = (
             k * self._dt_s,
@@ -192,7 +192,7 @@ class Drive:
         speed = self.car.speed_mps
         floor = self._params.driver.power_speed_floor_mps
         force_n = self._look().brake * full_braking_w(speed, self._params) / max(speed, floor)
-        return (-force_n * self._params.wheel.radius_m / 4.0,) * 4
+        return (-force_n * self._params.front.wheel.radius_m / 4.0,) * 4
 
     def run(self) -> Run:
         """What has been driven so far."""

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from iwm_power_manager.vehicle import VehicleParams
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_sim.closed_loop import Run
 
 FloatArray = npt.NDArray[np.float64]

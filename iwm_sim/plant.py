@@ -31,7 +31,7 @@ from iwm_power_manager.model.motor import (
     regeneration_limit_nm,
     torque_limit_nm,
 )
-from iwm_power_manager.vehicle import Battery, VehicleParams
+from iwm_power_manager.model.parameters import Battery, VehicleParams
 
 
 class Energies(NamedTuple):
@@ -83,7 +83,7 @@ class PlantState(NamedTuple):
 def initial_plant(vehicle: VehicleParams, soc: float = 0.8, speed_mps: float = 0.0) -> PlantState:
     """A rested, cold car at a speed, its wheels rolling."""
     zero = (0.0, 0.0, 0.0, 0.0)
-    wheel = speed_mps / vehicle.wheel.radius_m
+    wheel = speed_mps / vehicle.front.wheel.radius_m
     return PlantState(
         speed_mps=float(speed_mps),
         wheel_speed_radps=(wheel, wheel, wheel, wheel),
@@ -119,8 +119,8 @@ def obeyed_torque_nm(
     command_nm: float, wheel_speed_radps: float, speed_mps: float, heat: float, vehicle: VehicleParams
 ) -> float:
     """What a motor makes of a command: it saturates at its own limits."""
-    highest = torque_limit_nm(wheel_speed_radps, heat, vehicle.motor)
-    lowest = -regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, vehicle.motor)
+    highest = torque_limit_nm(wheel_speed_radps, heat, vehicle.front.motor)
+    lowest = -regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, vehicle.front.motor)
     return min(max(command_nm, lowest), highest)
 
 
@@ -153,14 +153,14 @@ def advance(
     substeps : implicit steps it is divided into, >= 1
     """
     battery = vehicle.battery
-    motor = vehicle.motor
-    radius = vehicle.wheel.radius_m
+    motor = vehicle.front.motor
+    radius = vehicle.front.wheel.radius_m
     m0 = obeyed_torque_nm(motor_command_nm[0], state.wheel_speed_radps[0], state.speed_mps, state.heat[0], vehicle)
     m1 = obeyed_torque_nm(motor_command_nm[1], state.wheel_speed_radps[1], state.speed_mps, state.heat[1], vehicle)
     m2 = obeyed_torque_nm(motor_command_nm[2], state.wheel_speed_radps[2], state.speed_mps, state.heat[2], vehicle)
     m3 = obeyed_torque_nm(motor_command_nm[3], state.wheel_speed_radps[3], state.speed_mps, state.heat[3], vehicle)
     motors = (m0, m1, m2, m3)
-    most = vehicle.friction_brake.max_torque_nm
+    most = vehicle.front.friction_brake.max_torque_nm
     brakes = (
         min(max(-friction_command_nm[0], 0.0), most),
         min(max(-friction_command_nm[1], 0.0), most),

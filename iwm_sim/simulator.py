@@ -33,6 +33,7 @@ from std_msgs.msg import Bool
 from iwm_power_manager.control.types import Wheels
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import IwmError
+from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.ros import ending, qos
 from iwm_power_manager.ros import messages as m
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
@@ -40,7 +41,7 @@ from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.parameters import Change, Spec, declare
 from iwm_power_manager.share import resolve
-from iwm_power_manager.vehicle import IDLE_DRIVES, load_vehicle
+from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.drive import Drive, save_run
 from iwm_sim.pacing import FRICTION, MOTOR, Exchange, NoAnswerError, Pacer
 

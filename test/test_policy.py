@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iwm_power_manager import policy as policy_module
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.errors import PolicyError
 from iwm_power_manager.mdp.demand import Source, demand_chain
 from iwm_power_manager.mdp.policy_iteration import solve
@@ -23,7 +24,6 @@ from iwm_power_manager.mdp.transitions import build_model
 from iwm_power_manager.policy import (
     choose,
     cost_quantum_j,
-    empty_table,
     load_policy,
     load_policy_bank,
     make_policy,

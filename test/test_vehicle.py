@@ -209,10 +209,10 @@ def test_what_is_no_vehicle_file_is_refused_with_its_name(tmp_path, text):
 
 def test_the_paper_s_car_has_the_paper_s_numbers():
     params = load_vehicle(PAPER).params
-    chassis, motor, battery = params.chassis, params.motor, params.battery
+    chassis, motor, battery = params.chassis, params.front.motor, params.battery
     assert (chassis.mass_kg, chassis.frontal_area_m2, chassis.air_density_kgpm3) == (800.0, 1.66, 1.2)
     assert (chassis.front_axle_to_cg_m, chassis.rear_axle_to_cg_m, chassis.cg_height_m) == (0.92, 0.92, 0.6)
-    assert (params.wheel.radius_m, motor.max_power_w, motor.regeneration_torque_nm) == (0.33, 7500.0, 80.0)
+    assert (params.front.wheel.radius_m, motor.max_power_w, motor.regeneration_torque_nm) == (0.33, 7500.0, 80.0)
     assert (battery.cells_in_series, battery.nominal_cell_voltage_v, battery.capacity_ah) == (72.0, 3.3, 200.0)
     assert battery.resistance_ohm == 0.063
     assert battery.ohmic_resistance_ohm + battery.polarisation_resistance_ohm == pytest.approx(0.063)
@@ -226,7 +226,8 @@ def test_every_number_of_the_file_arrives_in_the_parameters_and_counts_for_the_c
     content = changed(path, value * (1.0 - 1e-9) if value else 1e-9)
     monkeypatch.setattr(vehicle.files, "read_yaml", lambda _: content)
     after = load_vehicle(PAPER)
-    old, new = getattr(before.params, section)._asdict(), getattr(after.params, section)._asdict()
+    holders = [car.params.front if section in car.params.front._fields else car.params for car in (before, after)]
+    old, new = (getattr(holder, section)._asdict() for holder in holders)
     different = [name for name, x in old.items() if not np.array_equal(x, new[name])]
     assert len(different) == 1
     assert different[0] == key or "loss" in path
@@ -241,10 +242,10 @@ def test_idle_drive_can_be_replaced():
         other = load_vehicle(PAPER, name)
         assert other.idle_drive == name
         again = with_idle_drive(car, name)
-        assert (again.hash, again.idle_drive, again.params.motor.idle_drive) == (
+        assert (again.hash, again.idle_drive, again.params.front.motor.idle_drive) == (
             other.hash,
             name,
-            other.params.motor.idle_drive,
+            other.params.front.motor.idle_drive,
         )
     assert len({load_vehicle(PAPER, name).hash for name in ("none", "drag", "enabled")}) == 3
     with pytest.raises(ConfigError, match=r"idle_drive: 'off' is unknown; allowed: none \| drag \| enabled"):
@@ -273,13 +274,14 @@ def test_shipped_vehicles_differ_from_the_paper_s_car_in_the_motor_only():
     car = load_vehicle(PAPER).params
     for name in ("direct_drive_hub", "jalalmaab_2015_map"):
         other = load_vehicle(FOLDER / f"{name}.yaml").params
-        for section in (s for s in car._fields if s != "motor"):
-            for ours, theirs in zip(getattr(car, section), getattr(other, section), strict=True):
-                assert np.array_equal(ours, theirs)
+        for mine, its in ((car, other), (car.front, other.front), (car.rear, other.rear)):
+            for section in (s for s in mine._fields if s not in ("motor", "front", "rear")):
+                for ours, theirs in zip(getattr(mine, section), getattr(its, section), strict=True):
+                    assert np.array_equal(ours, theirs)
 
 
 def test_the_hub_motor_has_its_own_losses():
-    motor = load_vehicle(FOLDER / "direct_drive_hub.yaml").params.motor
+    motor = load_vehicle(FOLDER / "direct_drive_hub.yaml").params.front.motor
     w, t = 50.0, 60.0
     assert enabled_loss_w(t, w, motor) == pytest.approx(40 + 1.57 * w + 0.0166 * w**2 + 1.50 * t + 0.045 * t**2)
 
@@ -288,14 +290,14 @@ def test_the_hub_motor_has_its_own_losses():
 
 
 def test_the_shipped_map_is_that_of_the_loss_coefficients():
-    motor = load_vehicle(PAPER).params.motor
+    motor = load_vehicle(PAPER).params.front.motor
     rows = np.genfromtxt(MAP, delimiter=",", names=True)
     for w, t, efficiency in zip(rows["speed_rad_s"], rows["torque_nm"], rows["efficiency"], strict=True):
         assert efficiency == pytest.approx(w * t / (w * t + loss_w(t, w, motor)), abs=6e-9)
 
 
 def test_a_map_gives_back_its_efficiencies_driving_and_regenerating():
-    motor = load_vehicle(FOLDER / "jalalmaab_2015_map.yaml").params.motor
+    motor = load_vehicle(FOLDER / "jalalmaab_2015_map.yaml").params.front.motor
     rows = np.genfromtxt(MAP, delimiter=",", names=True)
     for w, t, efficiency in zip(rows["speed_rad_s"], rows["torque_nm"], rows["efficiency"], strict=True):
         w, t = float(w), float(t)
@@ -304,8 +306,8 @@ def test_a_map_gives_back_its_efficiencies_driving_and_regenerating():
 
 
 def test_between_its_points_the_map_is_close_to_the_coefficients():
-    mapped = load_vehicle(FOLDER / "jalalmaab_2015_map.yaml").params.motor
-    motor = load_vehicle(PAPER).params.motor
+    mapped = load_vehicle(FOLDER / "jalalmaab_2015_map.yaml").params.front.motor
+    motor = load_vehicle(PAPER).params.front.motor
     for w in np.linspace(3.0, 100.0, 23):
         for t in np.linspace(-80.0, 150.0, 24):
             ours, theirs = enabled_loss_w(float(t), float(w), mapped), enabled_loss_w(float(t), float(w), motor)
@@ -413,7 +415,7 @@ def test_a_map_s_path_is_seen_from_the_vehicle_file(tmp_path):
     write(tmp_path, *GOOD)
     text = (FOLDER / "jalalmaab_2015_map.yaml").read_text().replace("../motors/siemens_pm_7500w.csv", "../map.csv")
     (tmp_path / "cars" / "car.yaml").write_text(text)
-    assert load_vehicle(tmp_path / "cars" / "car.yaml").params.motor.map_torque_nm.tolist() == [
+    assert load_vehicle(tmp_path / "cars" / "car.yaml").params.front.motor.map_torque_nm.tolist() == [
         -40.0,
         -20.0,
         20.0,

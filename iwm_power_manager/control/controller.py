@@ -24,10 +24,10 @@ from iwm_power_manager.control.supervision import (
     stale_inputs,
     supervise,
 )
+from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import Command, Measurement, Settings, initial_state
 from iwm_power_manager.model.limits import battery_limits_w
-from iwm_power_manager.policy import PolicyTable
-from iwm_power_manager.vehicle import VehicleParams
+from iwm_power_manager.model.parameters import VehicleParams
 
 #: While a wheel is lost, slip is judged this much more strictly: its axle is watched through one wheel only.
 LOST_WHEEL_SLIP_FACTOR = 0.5
@@ -136,7 +136,7 @@ class Controller:
         monitor, supervision = self.monitor, self.supervision
         speed = monitor.speed_mps
         wheels = monitor.wheel_speed_radps
-        radius = self._vehicle.wheel.radius_m
+        radius = self._vehicle.front.wheel.radius_m
         if supervision.stale & STALE_SPEED and not supervision.stale & STALE_WHEELS:
             # The wheel that slips least tells the speed best.
             speed = max(radius * (max(wheels) if monitor.demand_w < 0.0 else min(wheels)), 0.0)

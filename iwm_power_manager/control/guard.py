@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from iwm_power_manager.control.types import GATE_BOTH, GATE_FRONT, GATE_NONE, GATE_REAR, Command
-from iwm_power_manager.vehicle import VehicleParams
+from iwm_power_manager.model.parameters import VehicleParams
 
 #: Gate codes under which each wheel has to be at zero torque.
 _GATES_OF_WHEEL = ((GATE_FRONT, GATE_BOTH), (GATE_FRONT, GATE_BOTH), (GATE_REAR, GATE_BOTH), (GATE_REAR, GATE_BOTH))
@@ -26,12 +26,12 @@ def violated_bound(command: Command, vehicle: VehicleParams) -> str:
     """
     if command.gate not in (GATE_NONE, GATE_FRONT, GATE_REAR, GATE_BOTH):
         return f"gate {command.gate} does not exist"
-    brake = vehicle.friction_brake.max_torque_nm
+    brake = vehicle.front.friction_brake.max_torque_nm
     for i, (motor, friction) in enumerate(zip(command.motor_torque_nm, command.friction_torque_nm, strict=True)):
         if not math.isfinite(motor) or not math.isfinite(friction):
             return f"torque of wheel {i} is not finite: motor {motor}, friction {friction}"
-        if abs(motor) > vehicle.motor.peak_torque_nm + _SLACK_NM:
-            return f"motor torque of wheel {i} is {motor:g} N m, beyond {vehicle.motor.peak_torque_nm:g}"
+        if abs(motor) > vehicle.front.motor.peak_torque_nm + _SLACK_NM:
+            return f"motor torque of wheel {i} is {motor:g} N m, beyond {vehicle.front.motor.peak_torque_nm:g}"
         if not -brake - _SLACK_NM <= friction <= 0.0:
             return f"friction torque of wheel {i} is {friction:g} N m, outside {-brake:g}..0"
         if command.gate in _GATES_OF_WHEEL[i] and (motor != 0.0 or friction != 0.0):

@@ -22,6 +22,7 @@ import math
 from iwm_power_manager.control.slew import approached, slewed
 from iwm_power_manager.control.slip import UNLIMITED_NM, axle_slip, filtered, road_torque_nm, torque_room_nm
 from iwm_power_manager.control.split import decide
+from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import (
     GATE_MODE_LIMITER,
     GATE_MODE_OFF,
@@ -42,9 +43,8 @@ from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.gate import axle_gated, gated_split
 from iwm_power_manager.model.limits import battery_scale, car_power_w
 from iwm_power_manager.model.motor import heat_after, regeneration_limit_nm, torque_limit_nm
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.torque import allocate, blend, conversion_speed_radps
-from iwm_power_manager.policy import PolicyTable
-from iwm_power_manager.vehicle import VehicleParams
 
 #: A motor torque below this is rounding noise of a share or a fade; zero lets the drive go idle.
 ZERO_TORQUE_NM = 1e-6
@@ -67,8 +67,8 @@ def _inside(
     """A slewed motor torque, cut to what gate, motor and grip allow in this step."""
     if gated:
         return 0.0
-    driving_room = torque_limit_nm(wheel_speed_radps, heat, vehicle.motor)
-    braking_room = regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, vehicle.motor)
+    driving_room = torque_limit_nm(wheel_speed_radps, heat, vehicle.front.motor)
+    braking_room = regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, vehicle.front.motor)
     if braking:
         braking_room = min(braking_room, grip_nm)
     else:
@@ -109,8 +109,8 @@ def step(
     -------
     Command, ControllerState
     """
-    radius = vehicle.wheel.radius_m
-    inertia = vehicle.wheel.inertia_kgm2
+    radius = vehicle.front.wheel.radius_m
+    inertia = vehicle.front.wheel.inertia_kgm2
     speed = max(measurement.speed_mps, 0.0)
     demand = measurement.power_demand_w
     dt = measurement.dt_s
@@ -185,11 +185,11 @@ def step(
             settings.slip_filter_s,
         )
     if braking:
-        front_room = vehicle.friction_brake.max_torque_nm
+        front_room = vehicle.front.friction_brake.max_torque_nm
         rear_room = front_room
     else:
-        front_room = torque_limit_nm(front_fast, state.front_heat, vehicle.motor)
-        rear_room = torque_limit_nm(rear_fast, state.rear_heat, vehicle.motor)
+        front_room = torque_limit_nm(front_fast, state.front_heat, vehicle.front.motor)
+        rear_room = torque_limit_nm(rear_fast, state.rear_heat, vehicle.front.motor)
     front_grip = UNLIMITED_NM
     rear_grip = UNLIMITED_NM
     if settings.gate_mode == GATE_MODE_LIMITER:
@@ -226,7 +226,7 @@ def step(
                 limits |= LIMIT_FRICTION_BRAKE
             else:
                 limits |= LIMIT_MOTOR
-                if room < torque_limit_nm(fast, 0.0, vehicle.motor):
+                if room < torque_limit_nm(fast, 0.0, vehicle.front.motor):
                     limits |= LIMIT_THERMAL
     front_motor, front_friction = blend(front_total, front_fast, speed, state.front_heat, vehicle)
     rear_motor, rear_friction = blend(rear_total, rear_fast, speed, state.rear_heat, vehicle)
@@ -256,15 +256,15 @@ def step(
         rear_speed,
         measurement.discharge_limit_w,
         measurement.charge_limit_w,
-        vehicle.motor,
+        vehicle.front.motor,
     )
     if scale < 1.0:
-        power = car_power_w(front_slewed, rear_slewed, front_speed, rear_speed, vehicle.motor)
+        power = car_power_w(front_slewed, rear_slewed, front_speed, rear_speed, vehicle.front.motor)
         limits |= LIMIT_BATTERY_CHARGE if power < 0.0 else LIMIT_BATTERY_DISCHARGE
     front_motor = scale * front_slewed
     rear_motor = scale * rear_slewed
     if braking:
-        most = vehicle.friction_brake.max_torque_nm
+        most = vehicle.front.friction_brake.max_torque_nm
         front_friction = _friction(front_total, front_motor, most)
         rear_friction = _friction(rear_total, rear_motor, most)
 
@@ -299,7 +299,7 @@ def step(
         rear_slip,
         front_gated,
         rear_gated,
-        heat_after(state.front_heat, front_motor, dt, vehicle.motor),
-        heat_after(state.rear_heat, rear_motor, dt, vehicle.motor),
+        heat_after(state.front_heat, front_motor, dt, vehicle.front.motor),
+        heat_after(state.rear_heat, rear_motor, dt, vehicle.front.motor),
     )
     return command, after

@@ -10,6 +10,7 @@ slow to take back. `preview` plays a schedule made with the whole cycle known.
 
 from __future__ import annotations
 
+from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import (
     EQUAL,
     INSTANTANEOUS,
@@ -22,10 +23,9 @@ from iwm_power_manager.control.types import (
 )
 from iwm_power_manager.grid import interpolate5, locate
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.mdp.transitions import step_cost_and_next
+from iwm_power_manager.model.decision import step_cost_and_next
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
-from iwm_power_manager.policy import PolicyTable
-from iwm_power_manager.vehicle import VehicleParams
 
 #: Price of a joule that is not delivered, in joules: high enough that delivering always comes first.
 PRICE_OF_MISSING = 20.0

@@ -42,7 +42,7 @@ from iwm_power_manager.jit import kernel
 from iwm_power_manager.mdp.problem import DRIVEN, Problem
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.driver import DriverState, Trace, drive, sample
-from iwm_power_manager.vehicle import VehicleParams
+from iwm_power_manager.model.parameters import VehicleParams
 
 #: Rows with less data than this are called thin: 10 s at the paper's step.
 THIN_ROW_STEPS = 100

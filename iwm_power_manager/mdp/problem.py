@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,61 +29,22 @@ from iwm_power_manager.files import (
     dotted,
     read_yaml,
 )
+from iwm_power_manager.model.decision import (
+    ERROR_NORMS,
+    POWER_ERRORS,
+    SKID_AVOIDANCE,
+    SLIP_MODELS,
+    ProblemParams,
+)
 
 FORMAT = 1
-
-#: Where the delivered power is measured: torque times speed at the wheel (sees no power lost in slip), or at the
-#: road, where it moves the car.
-POWER_ERROR_WHEEL, POWER_ERROR_ROAD = range(2)
-POWER_ERRORS = {"wheel": POWER_ERROR_WHEEL, "road": POWER_ERROR_ROAD}
-
-#: What an error e (W, demanded minus delivered) costs per second, in W:
-#: squared alpha * e^2 / 1 kW; absolute alpha * |e|; lagrange alpha * e towards the demand, so that a surplus is
-#: credited: the multiplier of "deliver the demand on average".
-ERROR_SQUARED, ERROR_ABSOLUTE, ERROR_LAGRANGE = range(3)
-ERROR_NORMS = {"squared": ERROR_SQUARED, "absolute": ERROR_ABSOLUTE, "lagrange": ERROR_LAGRANGE}
 
 #: What a cycle says about the demand: the power that following it exactly needs, or what a driver asks for.
 EXACT, DRIVEN = CYCLE_DEMANDS = ("exact", "driven")
 
-#: dynamic: slip is a state and obeys wheel rotation (eq. 11). quasi_steady: slip settles within a step at the value
-#: that carries the axle's force; slip is no state then.
-SLIP_DYNAMIC, SLIP_QUASI_STEADY = range(2)
-SLIP_MODELS = {"dynamic": SLIP_DYNAMIC, "quasi_steady": SLIP_QUASI_STEADY}
-
-#: Skid avoidance inside the problem (Table 2): none; an axle beyond the critical slip in braking gets no power;
-#: or in driving as well.
-SKID_NONE, SKID_BRAKING, SKID_BOTH = range(3)
-SKID_AVOIDANCE = {"none": SKID_NONE, "braking": SKID_BRAKING, "both": SKID_BOTH}
-
 MAX_AXIS_POINTS = 1000
 #: State-control pairs: beyond it the solver would need gigabytes.
 MAX_PAIRS = 20_000_000
-
-
-class ProblemParams(NamedTuple):
-    """What the kernels need to know of the problem; all SI.
-
-    Attributes
-    ----------
-    dt_s : length of a decision step
-    friction : peak friction coefficient of the road
-    alpha : price of undelivered energy, J per J (squared: at an error of 1 kW)
-    power_error : POWER_ERROR_*
-    error_norm : ERROR_*
-    slip_model : SLIP_*
-    skid_avoidance : SKID_*
-    critical_slip : magnitude of slip beyond which an axle is gated
-    """
-
-    dt_s: float
-    friction: float
-    alpha: float
-    power_error: int
-    error_norm: int
-    slip_model: int
-    skid_avoidance: int
-    critical_slip: float
 
 
 @dataclass(frozen=True, eq=False)

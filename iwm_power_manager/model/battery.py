@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.vehicle import Battery
+from iwm_power_manager.model.parameters import Battery
 
 
 @kernel

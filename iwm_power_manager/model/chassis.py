@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.vehicle import Chassis, VehicleParams
+from iwm_power_manager.model.parameters import Chassis, VehicleParams
 
 GRAVITY_MPS2 = 9.81  # the standard rounded value; not a property of a car
 
@@ -51,5 +51,5 @@ def normal_forces_n(acceleration_mps2: float, speed_mps: float, grade: float, ch
 @kernel
 def equivalent_mass_kg(vehicle: VehicleParams) -> float:
     """Mass that accelerates, wheels' rotation included: m + 4 I / r^2."""
-    radius = vehicle.wheel.radius_m
-    return vehicle.chassis.mass_kg + 4.0 * vehicle.wheel.inertia_kgm2 / (radius * radius)
+    radius = vehicle.front.wheel.radius_m
+    return vehicle.chassis.mass_kg + 4.0 * vehicle.front.wheel.inertia_kgm2 / (radius * radius)

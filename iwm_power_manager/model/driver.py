@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.pedals import full_braking_w, full_power_w, pedal_power_w
-from iwm_power_manager.vehicle import VehicleParams
 
 #: Below these speeds, m/s, trace and car count as standing; the driver then rests a foot on the brake. Schedules
 #: recorded on real roads hold speeds of 0.1 to 0.4 mph at stops (NYCC has 35 such seconds): nobody drives those.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.motor import electrical_power_w
-from iwm_power_manager.vehicle import Battery, Motor
+from iwm_power_manager.model.parameters import Battery, Motor
 
 
 @kernel

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n, rolling_force_n
+from iwm_power_manager.model.parameters import Tyre, VehicleParams, Wheel
 from iwm_power_manager.model.tyre import friction_and_slope, friction_coefficient, slip_ratio
-from iwm_power_manager.vehicle import Tyre, VehicleParams, Wheel
 
 Four = tuple[float, float, float, float]  # front_left, front_right, rear_left, rear_right
 
@@ -128,8 +128,8 @@ def step(
     dt_s : step, > 0
     """
     chassis = vehicle.chassis
-    wheel = vehicle.wheel
-    tyre = vehicle.tyre
+    wheel = vehicle.front.wheel
+    tyre = vehicle.front.tyre
     mass = chassis.mass_kg
     # A change of the car's speed drags the wheels' inertia along: the known slope makes the iteration a Newton step.
     coupling = 1.0 + 4.0 * wheel.inertia_kgm2 / (wheel.radius_m * wheel.radius_m * mass)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from iwm_power_manager.grid import locate
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.vehicle import IDLE_DRAG, IDLE_ENABLED, Motor
+from iwm_power_manager.model.parameters import IDLE_DRAG, IDLE_ENABLED, Motor
 
 
 @kernel

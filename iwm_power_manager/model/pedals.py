@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
-from iwm_power_manager.vehicle import VehicleParams
+from iwm_power_manager.model.parameters import VehicleParams
 
 
 @kernel
 def full_power_w(speed_mps: float, vehicle: VehicleParams) -> float:
     """Power of the fully pressed accelerator, W."""
-    motor = vehicle.motor
-    wheel_speed = max(speed_mps, vehicle.driver.power_speed_floor_mps) / vehicle.wheel.radius_m
+    motor = vehicle.front.motor
+    wheel_speed = max(speed_mps, vehicle.driver.power_speed_floor_mps) / vehicle.front.wheel.radius_m
     return 4.0 * min(motor.peak_torque_nm * wheel_speed, motor.max_power_w)
 
 

@@ -12,8 +12,8 @@ from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, normal_forces_n, road_load_n
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.tyre import slip_at_friction, wheel_speed_at_slip
-from iwm_power_manager.vehicle import VehicleParams
 
 #: Part of the peak friction a strategy plans with. The rest is the distance the slip limiter keeps from the peak.
 USABLE_FRICTION = 0.99
@@ -27,11 +27,11 @@ def axle_power_w(
 
     Braking beyond the regeneration limit is friction's and brings nothing.
     """
-    radius = vehicle.wheel.radius_m
-    motor = vehicle.motor
+    radius = vehicle.front.wheel.radius_m
+    motor = vehicle.front.motor
     slip = 0.0
     if slip_aware and normal_n > 0.0:
-        slip = slip_at_friction(0.5 * force_n / normal_n, friction, vehicle.tyre)
+        slip = slip_at_friction(0.5 * force_n / normal_n, friction, vehicle.front.tyre)
     wheel_speed = wheel_speed_at_slip(slip, speed_mps, radius)
     torque = 0.5 * force_n * radius
     if torque < 0.0:
@@ -58,8 +58,8 @@ def split_power_w(
     battery power (W, eq. 21), missing force (N, >= 0)
     """
     chassis = vehicle.chassis
-    radius = vehicle.wheel.radius_m
-    motor = vehicle.motor
+    radius = vehicle.front.wheel.radius_m
+    motor = vehicle.front.motor
     rolling_speed = speed_mps / radius
     acceleration = (force_n - road_load_n(speed_mps, 0.0, chassis)) / equivalent_mass_kg(vehicle)
     normal_front, normal_rear = normal_forces_n(acceleration, speed_mps, 0.0, chassis)
@@ -81,7 +81,7 @@ def split_power_w(
     room_front = 1e12
     room_rear = 1e12
     if slip_aware:
-        grip = 2.0 * USABLE_FRICTION * friction * vehicle.tyre.peak_factor
+        grip = 2.0 * USABLE_FRICTION * friction * vehicle.front.tyre.peak_factor
         room_front = grip * normal_front
         room_rear = grip * normal_rear
     if sign > 0.0:
@@ -113,7 +113,7 @@ def demand_force_n(
     if not slip_aware:
         return force
     used = force / (vehicle.chassis.mass_kg * GRAVITY_MPS2)
-    most = USABLE_FRICTION * friction * vehicle.tyre.peak_factor
-    slip = slip_at_friction(min(max(used, -most), most), friction, vehicle.tyre)
-    rim_speed = vehicle.wheel.radius_m * wheel_speed_at_slip(slip, speed_mps, vehicle.wheel.radius_m)
+    most = USABLE_FRICTION * friction * vehicle.front.tyre.peak_factor
+    slip = slip_at_friction(min(max(used, -most), most), friction, vehicle.front.tyre)
+    rim_speed = vehicle.front.wheel.radius_m * wheel_speed_at_slip(slip, speed_mps, vehicle.front.wheel.radius_m)
     return power_demand_w / max(rim_speed, floor)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.motor import regeneration_limit_nm
-from iwm_power_manager.vehicle import VehicleParams
+from iwm_power_manager.model.parameters import VehicleParams
 
 
 @kernel
@@ -17,7 +17,7 @@ def conversion_speed_radps(
     divisor never falls below the wheel speed at the critical braking slip, nor below the speed floor. Inside the
     desired slip interval, above the floor, it is eq. 16 as printed.
     """
-    radius = vehicle.wheel.radius_m
+    radius = vehicle.front.wheel.radius_m
     held = speed_mps * (1.0 - critical_slip) / radius
     return max(wheel_speed_radps, held, vehicle.driver.power_speed_floor_mps / radius)
 
@@ -45,5 +45,5 @@ def blend(
     """
     if torque_nm >= 0.0:
         return torque_nm, 0.0
-    regeneration = min(-torque_nm, regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, vehicle.motor))
+    regeneration = min(-torque_nm, regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, vehicle.front.motor))
     return -regeneration, torque_nm + regeneration

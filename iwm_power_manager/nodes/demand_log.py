@@ -8,10 +8,10 @@ from pathlib import Path
 
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.control.supervision import MODE_NORMAL
+from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.mdp.demand_counts import DemandCounter, load_transitions, save_transitions
 from iwm_power_manager.mdp.problem import load_problem
-from iwm_power_manager.policy import PolicyTable
 from iwm_power_manager.ros import diagnostics
 from iwm_power_manager.share import share_path
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.control.types import SDP, SDP_LOOKAHEAD, STRATEGIES
 from iwm_power_manager.errors import PolicyError
-from iwm_power_manager.policy import Policy, PolicyTable, choose, empty_table, load_policy_bank
+from iwm_power_manager.policy import Policy, choose, load_policy_bank
 from iwm_power_manager.ros import diagnostics
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle

@@ -226,7 +226,7 @@ class PowerManager(LifecycleNode):
         if policies.fallback_reason:
             self.get_logger().warning(f"runs equal split instead of {values['strategy']}: {policies.fallback_reason}")
         limits = ControllerLimits(
-            config.input_limits(values, vehicle.params.wheel.radius_m),
+            config.input_limits(values, vehicle.params.front.wheel.radius_m),
             None if self._lockstep else config.age_limits_s(values),
             config.supervision_limits(values),
         )

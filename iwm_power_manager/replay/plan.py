@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.control.types import (
     GATE_MODES,
     PREVIEW,
@@ -18,7 +19,7 @@ from iwm_power_manager.control.types import (
 )
 from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import check_number, content_sha256
-from iwm_power_manager.policy import Policy, PolicyTable, choose, empty_table, load_policy_bank
+from iwm_power_manager.policy import Policy, choose, load_policy_bank
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 

@@ -168,7 +168,7 @@ class ReconstructedSteps:
         self._queue = lockstep.LockstepQueue()
         vehicle = plan.vehicle.params
         limits = ControllerLimits(
-            INPUT_LIMITS._replace(radius_m=vehicle.wheel.radius_m), None, SupervisionLimits(0.3, 2.0, 0.5, 0.5)
+            INPUT_LIMITS._replace(radius_m=vehicle.front.wheel.radius_m), None, SupervisionLimits(0.3, 2.0, 0.5, 0.5)
         )
         table = plan.policies.table(plan.settings.strategy, plan.friction)
         self._controller = Controller(vehicle, WHEEL_NAMES, limits, plan.settings, table, plan.friction)

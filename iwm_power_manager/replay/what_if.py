@@ -15,11 +15,11 @@ from iwm_power_manager.control.record import SIGNAL_NAMES, from_numbers
 from iwm_power_manager.control.types import STRATEGIES, Measurement, Wheels
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.run import STATE, Replay
 from iwm_power_manager.signals.joint_state import JointStateDecoder
 from iwm_power_manager.signals.mapping import SignalMapping, topic_named
-from iwm_power_manager.vehicle import VehicleParams
 
 _WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 _J_PER_WH = 3600.0
@@ -64,7 +64,7 @@ class EnergyMeter:
 
     def add(self, measurement: Measurement, motor_torque_nm: Wheels, friction_torque_nm: Wheels) -> None:
         """One step with these torques."""
-        motor, dt_s = self._vehicle.motor, measurement.dt_s
+        motor, dt_s = self._vehicle.front.motor, measurement.dt_s
         electrical = work = friction = drag = 0.0
         for speed, torque, brake in zip(
             measurement.wheel_speed_radps, motor_torque_nm, friction_torque_nm, strict=True

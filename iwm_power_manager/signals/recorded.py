@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from iwm_power_manager.bags.definitions import typestore
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.errors import BagError
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.pedals import pedal_power_w
 from iwm_power_manager.signals.cdr import PLAIN
 from iwm_power_manager.signals.mapping import Extractor, SignalMapping, extractors, load_mapping
-from iwm_power_manager.vehicle import VehicleParams
 
 FloatArray = NDArray[np.float64]
 

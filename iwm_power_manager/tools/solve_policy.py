@@ -36,12 +36,13 @@ from iwm_power_manager.mdp.demand_counts import transitions_source
 from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
 from iwm_power_manager.mdp.problem import Problem, load_problem
 from iwm_power_manager.mdp.transitions import build_model
+from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.policy import Policy, cost_quantum_j, load_policy, make_policy, save_policy
 from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.mapping import load_mapping
 from iwm_power_manager.signals.recorded import RecordedDrive, read_signal
 from iwm_power_manager.tools.solver_figures import draw_solution
-from iwm_power_manager.vehicle import IDLE_DRIVES, Vehicle, load_vehicle
+from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
 SOLVED, UNSOLVED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 

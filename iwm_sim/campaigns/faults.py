@@ -365,10 +365,10 @@ def _problems(session: Session, case: Case, commands: Sequence[relay.Observation
         if not all(map(math.isfinite, torques)):
             yield "a command that is not finite"
             return
-        if max(map(abs, command.motor_nm)) > vehicle.motor.peak_torque_nm + 1e-6:
+        if max(map(abs, command.motor_nm)) > vehicle.front.motor.peak_torque_nm + 1e-6:
             yield "a motor torque beyond the limit"
             return
-        if not all(-vehicle.friction_brake.max_torque_nm - 1e-6 <= t <= 0.0 for t in command.friction_nm):
+        if not all(-vehicle.front.friction_brake.max_torque_nm - 1e-6 <= t <= 0.0 for t in command.friction_nm):
             yield "a friction torque beyond the limit"
             return
         if "brake" in case.name and max(command.motor_nm) > 0.0:

@@ -24,11 +24,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize, minimize_scalar
 
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
-from iwm_power_manager.policy import empty_table
-from iwm_power_manager.vehicle import Battery, nominal_voltage_v, with_params
+from iwm_power_manager.model.parameters import Battery
+from iwm_power_manager.vehicle import nominal_voltage_v, with_params
 from iwm_sim import closed_loop
 from iwm_sim.study import cases, figures
 from iwm_sim.study.cases import Case
@@ -198,11 +199,13 @@ def _comparison(
         ohmic_factor_at_10_percent=1.0,
         polarisation_resistance_ohm=0.0,
     )
-    motor = params.motor._replace(continuous_torque_nm=params.motor.peak_torque_nm)
+    motor = params.front.motor._replace(continuous_torque_nm=params.front.motor.peak_torque_nm)
     model = closed_loop.run(
         cases.cycle_of(cycle),
         with_params(
-            cases.vehicle_of(vehicle, idle_drive), "control model", params._replace(battery=static, motor=motor)
+            cases.vehicle_of(vehicle, idle_drive),
+            "control model",
+            params._replace(battery=static).with_axles(motor=motor),
         ),
         default_settings("equal"),
         empty_table(),

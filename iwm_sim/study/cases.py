@@ -17,13 +17,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.control.types import SDP, SDP_LOOKAHEAD, STRATEGIES, Settings, default_settings
 from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
-from iwm_power_manager.policy import Policy, PolicyTable, empty_table, load_policy
+from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.policy import Policy, load_policy
 from iwm_power_manager.share import resolve
-from iwm_power_manager.vehicle import Vehicle, VehicleParams, load_vehicle, with_params
+from iwm_power_manager.vehicle import Vehicle, load_vehicle, with_params
 from iwm_sim import closed_loop, preview
 from iwm_sim.closed_loop import Noise, Run
 from iwm_sim.metrics import Metrics, measure
@@ -155,8 +157,11 @@ def _table_of(path: str) -> PolicyTable:
 def changed(params: VehicleParams, changes: Sequence[Change]) -> VehicleParams:
     """The numbers of a car with some of them replaced."""
     for change in changes:
-        section = getattr(params, change.section)._replace(**{change.name: float(change.value)})
-        params = params._replace(**{change.section: section})
+        value = {change.name: float(change.value)}
+        if change.section in params.front._fields:
+            params = params.with_axles(**{change.section: getattr(params.front, change.section)._replace(**value)})
+        else:
+            params = params._replace(**{change.section: getattr(params, change.section)._replace(**value)})
     return params
 
 

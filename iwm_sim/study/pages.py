@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write, read_text
-from iwm_power_manager.vehicle import VehicleParams
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_sim.metrics import CRITICAL_SLIP
 from iwm_sim.study import criteria, figures, paper, sensitivity
 from iwm_sim.study.report import Block, Column, Page, Picture, Pictures, Settings, Table, Text, Tile, Tiles, write_page

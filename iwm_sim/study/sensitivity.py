@@ -12,8 +12,8 @@ import numpy.typing as npt
 
 from iwm_power_manager.model.battery import chemical_power_w, depletion_per_joule
 from iwm_power_manager.model.motor import electrical_power_w, torque_limit_nm
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.tyre import wheel_speed_at_slip
-from iwm_power_manager.vehicle import VehicleParams
 from iwm_sim.study.figures import Curve
 
 FloatArray = npt.NDArray[np.float64]
@@ -37,11 +37,11 @@ def depletion_percent(
     """ΔSoC of one step, %; NaN where a motor cannot give its part."""
     total = 0.0
     for power, slip in ((front_power_w, front_slip), (demand_w - front_power_w, rear_slip)):
-        wheel_speed = wheel_speed_at_slip(slip, speed_mps, vehicle.wheel.radius_m)
+        wheel_speed = wheel_speed_at_slip(slip, speed_mps, vehicle.front.wheel.radius_m)
         torque = power / (2.0 * wheel_speed)
-        if torque > torque_limit_nm(wheel_speed, 0.0, vehicle.motor) * (1.0 + 1e-9):
+        if torque > torque_limit_nm(wheel_speed, 0.0, vehicle.front.motor) * (1.0 + 1e-9):
             return float("nan")
-        total += 2.0 * electrical_power_w(torque, wheel_speed, vehicle.motor)
+        total += 2.0 * electrical_power_w(torque, wheel_speed, vehicle.front.motor)
     chemical_j = chemical_power_w(total, vehicle.battery) * STEP_S
     return float(100.0 * chemical_j * depletion_per_joule(vehicle.battery))
 

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import GATE_MODES, STRATEGIES, default_settings, initial_state
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.tyre import slip_ratio
-from iwm_power_manager.policy import empty_table
-from iwm_power_manager.vehicle import VehicleParams
 from iwm_sim import closed_loop, plant
 from iwm_sim.metrics import CRITICAL_SLIP, MOVING_MPS, longest_s
 from iwm_sim.study import cases
@@ -47,7 +47,7 @@ def best_stop_m(friction: float, from_mps: float, vehicle: VehicleParams) -> tup
     gives mu(s) of its load, the loads sum up to the weight, so the deceleration is g (mu(s) + c_rr) + k v^2 and the
     distance its closed integral.
     """
-    tyre, chassis = vehicle.tyre, vehicle.chassis
+    tyre, chassis = vehicle.front.tyre, vehicle.chassis
     slip = np.linspace(1e-3, 1.0, 5000)
     x = tyre.stiffness_factor * slip
     angle = tyre.shape_factor * np.arctan(x - tyre.curvature_factor * (x - np.arctan(x)))
@@ -68,7 +68,7 @@ def emergency_stop(stop: Stop) -> dict[str, Any]:
         settings = settings._replace(gate_hysteresis=0.0, gate_driving=False)  # as printed
     table = cases.policy_of(stop.policy).table() if stop.policy else empty_table()
     road = (stop.friction,) * 4
-    rolling = params.wheel.radius_m
+    rolling = params.front.wheel.radius_m
     car = plant.initial_plant(params, 0.8, stop.from_mps)
     memory = initial_state()
     slips, speeds, accelerations = [], [], []
@@ -82,7 +82,7 @@ def emergency_stop(stop: Stop) -> dict[str, Any]:
         command, memory = law.step(measurement, memory, settings, params, table)
         slips.append(
             [
-                slip_ratio(car.wheel_speed_radps[wheel], car.speed_mps, rolling, params.tyre.slip_speed_floor_mps)
+                slip_ratio(car.wheel_speed_radps[wheel], car.speed_mps, rolling, params.front.tyre.slip_speed_floor_mps)
                 for wheel in (0, 2)
             ]
         )

@@ -25,14 +25,15 @@ import numpy as np
 from tqdm import tqdm
 
 from iwm_power_manager import files, jit
+from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.control.types import PREVIEW, STRATEGIES, Settings
 from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError, IwmError
+from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.nodes import power_manager_config
 from iwm_power_manager.nodes.policy_choice import choose_policies
-from iwm_power_manager.policy import PolicyTable, empty_table
 from iwm_power_manager.share import resolve
-from iwm_power_manager.vehicle import IDLE_DRIVES, Vehicle, load_vehicle
+from iwm_power_manager.vehicle import Vehicle, load_vehicle
 from iwm_sim import closed_loop, metrics
 from iwm_sim.closed_loop import Run
 from iwm_sim.domains import claimed_domain

@@ -21,7 +21,7 @@ from iwm_power_manager import __version__
 from iwm_power_manager.control.types import GATE_MODES, STRATEGIES, Settings, default_settings
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.files import atomic_write
-from iwm_power_manager.vehicle import IDLE_DRIVES
+from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.study import battery_fit, cases, reproduce
 from iwm_sim.study.cases import POLICY_STRATEGIES, REFERENCE, Case, Result, SensorNoise

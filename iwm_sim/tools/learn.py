@@ -30,17 +30,19 @@ import numpy as np
 from tqdm import tqdm
 
 from iwm_power_manager import __version__
+from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import Cycle, load_cycle, make_cycle
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.files import atomic_write, check_number
 from iwm_power_manager.mdp.demand import Source, chain_of, source_of
 from iwm_power_manager.mdp.problem import Problem
-from iwm_power_manager.policy import Policy, PolicyTable, empty_table, load_policy, save_policy
+from iwm_power_manager.model.parameters import IDLE_DRIVES
+from iwm_power_manager.policy import Policy, load_policy, save_policy
 from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.recorded import RecordedDrive
 from iwm_power_manager.tools.solve_policy import drive_source, load_grid, read_drives, solve_one, targets
-from iwm_power_manager.vehicle import IDLE_DRIVES, Vehicle, load_vehicle
+from iwm_power_manager.vehicle import Vehicle, load_vehicle
 from iwm_sim import closed_loop
 from iwm_sim.metrics import measure
 from iwm_sim.study.driving import cores, on_all_cores

@@ -28,16 +28,16 @@ from iwm_power_manager.control.supervision import (
     STALE_WHEELS,
     SupervisionLimits,
 )
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import GATE_BOTH, GATE_FRONT, GATE_REAR, default_settings, initial_state
 from iwm_power_manager.model.limits import car_power_w
 from iwm_power_manager.nodes import power_manager_config as config
-from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 
 NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 VEHICLE = load_vehicle(resolve(Path("config/vehicles/jalalmaab_2015.yaml"))).params
-RADIUS = VEHICLE.wheel.radius_m
+RADIUS = VEHICLE.front.wheel.radius_m
 MS = 1_000_000
 DT = 0.01
 VALUES: dict[str, Any] = {spec.name: spec.default for spec in config.SPECS}
@@ -282,7 +282,7 @@ class TestBattery:
         assert values["charge_limit_w"] == 0.0
         front, _, rear, _ = motor(values)
         # A little braking torque is left to the motors: what their own losses eat up.
-        assert car_power_w(front, rear, 10.0 / RADIUS, 10.0 / RADIUS, VEHICLE.motor) >= -1e-6
+        assert car_power_w(front, rear, 10.0 / RADIUS, 10.0 / RADIUS, VEHICLE.front.motor) >= -1e-6
         assert (sum(friction(values)) + sum(motor(values))) * 10.0 / RADIUS == pytest.approx(-4000.0)
         assert sum(friction(values)) < 10.0 * sum(motor(values))
 
@@ -398,7 +398,7 @@ def test_whatever_comes_in_every_command_is_finite_limited_and_slew_limited(sequ
         drive.run(35)
     up = drive.controller.settings.slew_up_nmps * DT
     before = drive.commands[-1].motor_torque_nm if drive.commands else (0.0,) * 4
-    peak, power = VEHICLE.motor.peak_torque_nm, VEHICLE.motor.max_power_w
+    peak, power = VEHICLE.front.motor.peak_torque_nm, VEHICLE.front.motor.max_power_w
     for batch in sequence:
         for message in batch:
             feed(drive, message)
@@ -409,7 +409,7 @@ def test_whatever_comes_in_every_command_is_finite_limited_and_slew_limited(sequ
             torque, brake = command.motor_torque_nm[i], command.friction_torque_nm[i]
             assert abs(torque) <= peak + 1e-6
             assert torque * values[f"{wheel}_speed_radps"] <= power * (1.0 + 1e-9)
-            assert -VEHICLE.friction_brake.max_torque_nm - 1e-6 <= brake <= 0.0
+            assert -VEHICLE.front.friction_brake.max_torque_nm - 1e-6 <= brake <= 0.0
             assert torque <= max(before[i], 0.0) + up + 1e-9
             gated = (GATE_FRONT, GATE_BOTH) if i < 2 else (GATE_REAR, GATE_BOTH)
             if command.gate in gated:

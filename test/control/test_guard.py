@@ -9,8 +9,9 @@ import pytest
 
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.types import GATE_BOTH, GATE_FRONT, GATE_NONE, GATE_REAR, Command
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.share import resolve
-from iwm_power_manager.vehicle import VehicleParams, load_vehicle
+from iwm_power_manager.vehicle import load_vehicle
 
 PEAK, BRAKE = 200.0, 900.0
 
@@ -19,8 +20,8 @@ PEAK, BRAKE = 200.0, 900.0
 def vehicle() -> VehicleParams:
     params = load_vehicle(resolve(Path("config/vehicles/jalalmaab_2015.yaml"))).params
     return params._replace(
-        motor=params.motor._replace(peak_torque_nm=PEAK),
-        friction_brake=params.friction_brake._replace(max_torque_nm=BRAKE),
+        motor=params.front.motor._replace(peak_torque_nm=PEAK),
+        friction_brake=params.front.friction_brake._replace(max_torque_nm=BRAKE),
     )
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control import law
 from iwm_power_manager.control import types as t
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import (
     Command,
     ControllerState,
@@ -19,7 +20,7 @@ from iwm_power_manager.control.types import (
     default_settings,
     initial_state,
 )
-from iwm_power_manager.policy import empty_table, load_policy
+from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from oracles import control_law as oracle
@@ -35,7 +36,7 @@ CARS = {
     for name in ("none", "drag", "enabled")
 }
 CAR = CARS["drag"]
-RADIUS = CAR.wheel.radius_m
+RADIUS = CAR.front.wheel.radius_m
 TABLE = empty_table(rule=(300.0, 0.4, -200.0, 0.7), schedule=(0.5, 0.0, 1.0, 0.3, 0.85, 1.0))
 DEFAULT = default_settings()
 NO_LIMIT = 47500.0
@@ -86,7 +87,8 @@ class Case(NamedTuple):
 
     def battery_w(self, factor=1.0):
         return sum(
-            2.0 * electrical_w(factor * motor, 0.5 * sum(wheels), self.car.motor) for wheels, motor, *_ in self.axles()
+            2.0 * electrical_w(factor * motor, 0.5 * sum(wheels), self.car.front.motor)
+            for wheels, motor, *_ in self.axles()
         )
 
 
@@ -200,19 +202,19 @@ def every_number_is_finite(case):
 def the_motors_stay_within_torque_and_power(case):
     for wheels, motor, _, _, heat, _ in case.axles():
         fastest = max(*wheels, 0.0)
-        assert motor <= torque_limit(fastest, heat, case.car.motor) * (1.0 + 1e-12)
-        assert abs(motor) * fastest <= case.car.motor.max_power_w * (1.0 + 1e-12)
+        assert motor <= torque_limit(fastest, heat, case.car.front.motor) * (1.0 + 1e-12)
+        assert abs(motor) * fastest <= case.car.front.motor.max_power_w * (1.0 + 1e-12)
 
 
 def regeneration_stays_within_its_limit_and_fades_at_low_speed(case):
     for wheels, motor, _, _, heat, _ in case.axles():
-        limit = regeneration_limit(max(*wheels, 0.0), case.m.speed_mps, heat, case.car.motor)
+        limit = regeneration_limit(max(*wheels, 0.0), case.m.speed_mps, heat, case.car.front.motor)
         assert motor >= -limit - TORQUE_SLACK_NM
 
 
 def friction_brakes_only_brake_and_only_on_demand(case):
     for _, _, brake, *_ in case.axles():
-        assert -case.car.friction_brake.max_torque_nm <= brake <= 0.0
+        assert -case.car.front.friction_brake.max_torque_nm <= brake <= 0.0
         assert case.braking or brake == 0.0
 
 
@@ -247,12 +249,12 @@ def torque_falls_no_faster_than_its_rate_but_by_a_gate_or_a_limit(case):
         towards_zero = math.copysign(abs(before) - fall, before)
         fast = max(*wheels, case.conversion(wheels))
         if before > 0.0:
-            room = torque_limit(fast, heat, case.car.motor)
+            room = torque_limit(fast, heat, case.car.front.motor)
             if not case.braking:
                 room = min(room, case.grip_nm(i))
             assert motor >= min(towards_zero, room) - 1e-6
         else:
-            room = regeneration_limit(fast, case.m.speed_mps, heat, case.car.motor)
+            room = regeneration_limit(fast, case.m.speed_mps, heat, case.car.front.motor)
             if case.braking:
                 room = min(room, case.grip_nm(i))
             assert motor <= max(towards_zero, -room) + 1e-6
@@ -269,7 +271,7 @@ def without_gate_and_limit_the_torques_sum_to_the_demand(case):
 def braking_always_gets_through(case):
     if not case.braking or case.command.gate == t.GATE_BOTH or case.command.limits & t.LIMIT_SLIP:
         return
-    most = case.car.friction_brake.max_torque_nm
+    most = case.car.front.friction_brake.max_torque_nm
     axles = case.axles()
     possible = sum(2.0 * case.conversion(wheels) * most for wheels, *_, gated in axles if not gated)
     owed = max(case.m.power_demand_w, -possible)
@@ -355,8 +357,8 @@ def it_does_what_the_plain_law_does(case):
         assert getattr(after, f"{name}_speed_radps") == near(axles[i].speed)
         assert getattr(after, f"{name}_road_nm") == near(axles[i].road)
         assert getattr(after, f"{name}_slip") == getattr(command, f"{name}_slip")
-        heat, tau = getattr(case.before, f"{name}_heat"), case.car.motor.thermal_time_constant_s
-        target = (ours[i][0] / case.car.motor.continuous_torque_nm) ** 2
+        heat, tau = getattr(case.before, f"{name}_heat"), case.car.front.motor.thermal_time_constant_s
+        target = (ours[i][0] / case.car.front.motor.continuous_torque_nm) ** 2
         assert getattr(after, f"{name}_heat") == near(oracle.low_pass(heat, target, case.m.dt_s, tau))
     assert (after.decided_share, after.applied_share) == (command.decided_share, command.front_share)
     assert after.steps == case.before.steps + 1
@@ -698,8 +700,8 @@ def test_the_limiter_holds_the_wheel_at_its_target_slip(demand, friction):
         torque = case.command.motor_torque_nm[0] + case.command.friction_torque_nm[0]
         for _ in range(20):
             x = oracle.slip(wheel, speed, RADIUS, 0.5)
-            road = RADIUS * load * friction_coefficient(x, friction, CAR.tyre)
-            wheel = max(wheel + dt / 20 * (torque - road) / CAR.wheel.inertia_kgm2, 0.0)
+            road = RADIUS * load * friction_coefficient(x, friction, CAR.front.tyre)
+            wheel = max(wheel + dt / 20 * (torque - road) / CAR.front.wheel.inertia_kgm2, 0.0)
         slips.append(oracle.slip(wheel, speed, RADIUS, 0.5))
         gates.append(case.command.gate)
     assert slips[-1] == pytest.approx(math.copysign(DEFAULT.slip_target, demand), abs=0.01)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control import types as t
 from iwm_power_manager.control.split import cheapest_share, decide, lookahead_share, rule_share, table_share
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import default_settings
-from iwm_power_manager.mdp.transitions import step_cost_and_next
-from iwm_power_manager.policy import empty_table
+from iwm_power_manager.model.decision import step_cost_and_next
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from oracles import splits
@@ -98,14 +98,14 @@ def test_a_change_has_to_save_the_switching_power():
 
 def test_at_equal_cost_the_share_stays():
     # No loss, no drag: whatever the split, the power is the same.
-    motor = CARS[0].motor._replace(
+    motor = CARS[0].front.motor._replace(
         loss_constant_w=0.0,
         loss_linear_speed=0.0,
         loss_quadratic_speed=0.0,
         loss_linear_torque=0.0,
         loss_quadratic_torque=0.0,
     )
-    car = CARS[0]._replace(motor=motor)
+    car = CARS[0].with_axles(motor=motor)
     assert cheapest_share(4000.0, 12.0, 0.37, 0.9, False, 0.0, car, TABLE) == 0.37
     assert decide(4000.0, 12.0, 0.0, 0.0, 0.37, 0.0, 0.9, 0, default_settings("instantaneous"), car, TABLE) == 0.37
 

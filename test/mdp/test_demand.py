@@ -144,7 +144,11 @@ def test_a_grade_costs_its_weight_and_a_standing_car_nothing():
 def test_a_driven_cycle_asks_for_what_the_plain_driver_asks_for_in_a_car_that_obeys():
     cycle = make_cycle("made", [0, 4, 6, 9, 12], [0.0, 8.0, 8.0, 0.0, 0.0], [0.0, 0.0, 0.05, 0.05, 0.0])
     source = driven_source(cycle, 0.1, CAR)
-    dt, ahead_s, mass = 0.01, CAR.driver.preview_s, 800.0 + 4.0 * CAR.wheel.inertia_kgm2 / CAR.wheel.radius_m**2
+    dt, ahead_s, mass = (
+        0.01,
+        CAR.driver.preview_s,
+        800.0 + 4.0 * CAR.front.wheel.inertia_kgm2 / CAR.front.wheel.radius_m**2,
+    )
 
     def trace(time):
         return float(np.interp(time, cycle.time_s, cycle.speed_mps))

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iwm_power_manager.mdp.problem import ERROR_NORMS, load_problem
-from iwm_power_manager.mdp.transitions import (
+from iwm_power_manager.mdp.problem import load_problem
+from iwm_power_manager.mdp.transitions import build_model, gated_states
+from iwm_power_manager.model.decision import (
+    ERROR_NORMS,
     axles_gated,
-    build_model,
     error_cost_j,
-    gated_states,
     step_cost_and_next,
     wheel_speed_of_state,
 )
@@ -57,7 +57,7 @@ def test_without_slip_the_power_at_the_road_is_the_power_at_the_wheels():
     vehicle = load_vehicle(CAR.path, "none").params
 
     def lost_j(stiffness):
-        car = vehicle._replace(tyre=vehicle.tyre._replace(stiffness_factor=stiffness))
+        car = vehicle.with_axles(tyre=vehicle.front.tyre._replace(stiffness_factor=stiffness))
         params = [_params(power_error=where, error_norm="lagrange", alpha=1.0) for where in ("road", "wheel")]
         road, wheel = (step_cost_and_next(5000.0, 15.0, 0.0, 0.0, 0.5, car, p).cost_j for p in params)
         return road - wheel
@@ -142,7 +142,7 @@ def test_a_gated_axle_gets_nothing_and_the_share_does_not_matter():
 
 @given(st.floats(0.0, 30.0), st.floats(-1.0, 1.0))
 def test_a_state_s_wheel_speed_has_the_state_s_slip(speed, slip):
-    tyre, radius = CAR.params.tyre, CAR.params.wheel.radius_m
+    tyre, radius = CAR.params.front.tyre, CAR.params.front.wheel.radius_m
     wheel_speed = wheel_speed_of_state(slip, speed, CAR.params)
     assert wheel_speed >= 0.0
     found = slip_ratio(wheel_speed, speed, radius, tyre.slip_speed_floor_mps)

@@ -76,26 +76,28 @@ def test_deratings_multiply():
 
 @given(TORQUE, TORQUE, SPEED, SPEED, st.sampled_from(CARS))
 def test_the_car_takes_what_its_four_motors_take(front, rear, front_speed, rear_speed, car):
-    expected = 2.0 * electrical_w(front, front_speed, car.motor) + 2.0 * electrical_w(rear, rear_speed, car.motor)
-    assert car_power_w(front, rear, front_speed, rear_speed, car.motor) == pytest.approx(expected, abs=1e-9)
+    expected = 2.0 * electrical_w(front, front_speed, car.front.motor) + 2.0 * electrical_w(
+        rear, rear_speed, car.front.motor
+    )
+    assert car_power_w(front, rear, front_speed, rear_speed, car.front.motor) == pytest.approx(expected, abs=1e-9)
 
 
 @given(TORQUE, TORQUE, SPEED, SPEED, st.floats(1.0, 47500.0), st.floats(1.0, 47500.0), st.sampled_from(CARS))
 def test_the_scale_is_the_largest_factor_inside_the_limits(
     front, rear, front_speed, rear_speed, discharge, charge, car
 ):
-    factor, _ = battery_factor((front, rear), (front_speed, rear_speed), discharge, charge, car.motor)
+    factor, _ = battery_factor((front, rear), (front_speed, rear_speed), discharge, charge, car.front.motor)
     assume(not math.isnan(factor))
-    ours = battery_scale(front, rear, front_speed, rear_speed, discharge, charge, car.motor)
+    ours = battery_scale(front, rear, front_speed, rear_speed, discharge, charge, car.front.motor)
     assert ours == pytest.approx(factor, rel=1e-9, abs=1e-9)
     assert 0.0 <= ours <= 1.0
     if ours > 0.0:
-        power = car_power_w(ours * front, ours * rear, front_speed, rear_speed, car.motor)
+        power = car_power_w(ours * front, ours * rear, front_speed, rear_speed, car.front.motor)
         assert -charge <= power <= discharge
 
 
 def test_exactly_at_a_limit_nothing_is_cut():
-    motor = CARS[0].motor
+    motor = CARS[0].front.motor
     drive, brake = car_power_w(50.0, 40.0, 45.0, 46.0, motor), car_power_w(-50.0, -40.0, 45.0, 46.0, motor)
     assert battery_scale(50.0, 40.0, 45.0, 46.0, drive, 0.0, motor) == 1.0
     assert battery_scale(-50.0, -40.0, 45.0, 46.0, 0.0, -brake, motor) == 1.0
@@ -104,7 +106,7 @@ def test_exactly_at_a_limit_nothing_is_cut():
 
 
 def test_a_limit_that_a_factor_meets_exactly_is_used_up():
-    motor = CARS[1].motor
+    motor = CARS[1].front.motor
     # One half is the first factor the search tries.
     drive, brake = car_power_w(25.0, 20.0, 45.0, 46.0, motor), car_power_w(-25.0, -20.0, 45.0, 46.0, motor)
     assert battery_scale(50.0, 40.0, 45.0, 46.0, drive, 0.0, motor) == 0.5
@@ -112,11 +114,11 @@ def test_a_limit_that_a_factor_meets_exactly_is_used_up():
 
 
 def test_an_empty_battery_takes_the_regeneration_that_fits_and_not_none():
-    motor = CARS[1].motor
+    motor = CARS[1].front.motor
     scale = battery_scale(-80.0, -80.0, 45.0, 45.0, 0.0, 500.0, motor)
     assert car_power_w(scale * -80.0, scale * -80.0, 45.0, 45.0, motor) == pytest.approx(-500.0, rel=1e-6)
 
 
 def test_where_zero_torque_is_already_too_much_nothing_is_driven():
-    assert battery_scale(50.0, 50.0, 45.0, 45.0, 10.0, 0.0, CARS[2].motor) == 0.0
-    assert battery_scale(-50.0, -50.0, 45.0, 45.0, 0.0, 0.0, CARS[1].motor) == 0.0
+    assert battery_scale(50.0, 50.0, 45.0, 45.0, 10.0, 0.0, CARS[2].front.motor) == 0.0
+    assert battery_scale(-50.0, -50.0, 45.0, 45.0, 0.0, 0.0, CARS[1].front.motor) == 0.0

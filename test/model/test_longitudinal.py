@@ -16,7 +16,7 @@ from oracles import physics
 from oracles.step import G, friction_coefficient
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
-RADIUS, INERTIA, MASS = CAR.wheel.radius_m, CAR.wheel.inertia_kgm2, CAR.chassis.mass_kg
+RADIUS, INERTIA, MASS = CAR.front.wheel.radius_m, CAR.front.wheel.inertia_kgm2, CAR.chassis.mass_kg
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 DRY = (0.9, 0.9, 0.9, 0.9)
 
@@ -51,7 +51,7 @@ def residuals(before, wheels, motion, motors, grade, friction, dt):
     left = [acceleration - (sum(motion.tyre_force_n) - aero - slope - motion.rolling_force_n) / MASS]
     for i in range(4):
         w = motion.wheel_speed_radps[i]
-        mu = friction_coefficient(physics.slip(w, v, RADIUS, 0.5), friction[i], CAR.tyre)
+        mu = friction_coefficient(physics.slip(w, v, RADIUS, 0.5), friction[i], CAR.front.tyre)
         left.append((motion.tyre_force_n[i] - normal[i // 2] * mu) / MASS)
         torque = motors[i] - motion.resisting_torque_nm[i] - RADIUS * motion.tyre_force_n[i]
         left.append(((w - wheels[i]) / dt - torque / INERTIA) * RADIUS)
@@ -122,7 +122,7 @@ def test_a_rolling_car_slows_down_by_its_road_load():
 @pytest.mark.parametrize("friction", [0.9, 0.5, 0.2])
 def test_locked_wheels_stop_the_car_within_v_squared_over_two_mu_g(friction):
     car = CAR._replace(chassis=CAR.chassis._replace(drag_coefficient=0.0, rolling_resistance=0.0))
-    sliding = abs(friction_coefficient(-1.0, friction, CAR.tyre))
+    sliding = abs(friction_coefficient(-1.0, friction, CAR.front.tyre))
     speed, _, distance, _ = drive(
         25.0, 25.0 / (sliding * G) + 2.0, 0.01, brake=four(900.0), friction=four(friction), car=car, wheels=NOTHING
     )
@@ -148,13 +148,13 @@ def test_brakes_hold_a_car_facing_downhill_and_without_them_it_rolls():
 
 
 def test_a_brake_stops_a_free_wheel_within_a_step_and_exerts_only_what_that_takes():
-    speed, force, brake = wheel_step(3.0, 0.0, 0.0, 900.0, 0.0, 0.9, 0.01, CAR.wheel, CAR.tyre)
+    speed, force, brake = wheel_step(3.0, 0.0, 0.0, 900.0, 0.0, 0.9, 0.01, CAR.front.wheel, CAR.front.tyre)
     assert (speed, force) == (0.0, 0.0)
     assert brake == pytest.approx(INERTIA * 3.0 / 0.01)
 
 
 def test_a_wheel_in_the_air_takes_all_the_torque():
-    speed, force, brake = wheel_step(3.0, 10.0, 50.0, 10.0, 0.0, 0.9, 0.01, CAR.wheel, CAR.tyre)
+    speed, force, brake = wheel_step(3.0, 10.0, 50.0, 10.0, 0.0, 0.9, 0.01, CAR.front.wheel, CAR.front.tyre)
     assert speed == pytest.approx(3.0 + 40.0 * 0.01 / INERTIA)
     assert (force, brake) == (pytest.approx(0.0, abs=1e-6), 10.0)
 

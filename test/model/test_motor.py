@@ -17,7 +17,7 @@ from oracles import physics
 from oracles.step import electrical_w, loss_w
 
 MOTORS = {
-    drive: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), drive).params.motor
+    drive: load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), drive).params.front.motor
     for drive in ("none", "drag", "enabled")
 }
 MOTOR = MOTORS["none"]

@@ -12,7 +12,7 @@ from iwm_power_manager.vehicle import load_vehicle
 from oracles.physics import regeneration_limit
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
-RADIUS = CAR.wheel.radius_m
+RADIUS = CAR.front.wheel.radius_m
 POWER = st.floats(0.0, 60e3)
 
 
@@ -65,7 +65,7 @@ def test_motor_and_friction_brake_share_the_braking(torque, wheel, speed, heat):
     if torque >= 0.0:
         assert (motor, friction) == (torque, 0.0)
         return
-    limit = regeneration_limit(wheel, speed, heat, CAR.motor)
+    limit = regeneration_limit(wheel, speed, heat, CAR.front.motor)
     assert motor == pytest.approx(max(torque, -limit), abs=1e-9)
     assert friction <= 0.0
     assert motor + friction == pytest.approx(torque, abs=1e-9)

@@ -7,12 +7,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from iwm_power_manager.model import tyre as model
+from iwm_power_manager.model.parameters import Tyre
 from iwm_power_manager.share import share_path
-from iwm_power_manager.vehicle import Tyre, load_vehicle
+from iwm_power_manager.vehicle import load_vehicle
 from oracles import physics
 from oracles.step import friction_coefficient
 
-PAPER = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params.tyre
+PAPER = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params.front.tyre
 TYRES = st.builds(
     Tyre, st.floats(5.0, 30.0), st.floats(1.2, 2.0), st.floats(0.5, 1.5), st.floats(-2.0, 0.99), st.just(0.5)
 )

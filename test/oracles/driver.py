@@ -8,12 +8,12 @@ from oracles.step import G
 
 def look(integral, speed, trace, ahead, slope, grade, dt, vehicle):
     """Accelerator, brake, power demand and the error integral afterwards."""
-    settings, motor, radius = vehicle.driver, vehicle.motor, vehicle.wheel.radius_m
+    settings, motor, radius = vehicle.driver, vehicle.front.motor, vehicle.front.wheel.radius_m
     rolling = max(speed, settings.power_speed_floor_mps)
     full_brake = settings.full_brake_g * vehicle.chassis.mass_kg * G * rolling
     if max(trace, ahead) < 0.2 and speed < 0.3:
         return 0.0, 0.1, -0.1 * full_brake, 0.0
-    mass = vehicle.chassis.mass_kg + 4.0 * vehicle.wheel.inertia_kgm2 / radius**2
+    mass = vehicle.chassis.mass_kg + 4.0 * vehicle.front.wheel.inertia_kgm2 / radius**2
     error = trace - speed
     wanted = mass * slope + road_load(speed, grade, vehicle.chassis)
     wanted += settings.proportional_n_per_mps * error + settings.integral_n_per_m * integral

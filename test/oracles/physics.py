@@ -79,13 +79,13 @@ def regeneration_limit(wheel, speed, heat, motor):
 
 def axle_w(force, speed, normal, friction, slip_aware, vehicle):
     """Electrical power of an axle's motors for its road force, slip settled."""
-    radius = vehicle.wheel.radius_m
-    s = slip_for(0.5 * force / normal, friction, vehicle.tyre) if slip_aware and normal > 0.0 else 0.0
+    radius = vehicle.front.wheel.radius_m
+    s = slip_for(0.5 * force / normal, friction, vehicle.front.tyre) if slip_aware and normal > 0.0 else 0.0
     wheel = (speed / (1.0 - s) if s > 0.0 else speed * (1.0 + s)) / radius
     torque = 0.5 * force * radius
     if torque < 0.0:
-        torque = max(torque, -regeneration_limit(wheel, speed, 0.0, vehicle.motor))
-    return 2.0 * electrical_w(torque, wheel, vehicle.motor)
+        torque = max(torque, -regeneration_limit(wheel, speed, 0.0, vehicle.front.motor))
+    return 2.0 * electrical_w(torque, wheel, vehicle.front.motor)
 
 
 def battery_w(power, battery):
@@ -103,7 +103,7 @@ def dynamics(speed, wheels, motors, resisting, grade, friction, seconds, vehicle
 
     The load transfer of the present acceleration is found by iteration.
     """
-    car, wheel, tyre = vehicle.chassis, vehicle.wheel, vehicle.tyre
+    car, wheel, tyre = vehicle.chassis, vehicle.front.wheel, vehicle.front.tyre
 
     def rates(_, x):
         v, w = x[0], x[1:]

@@ -41,7 +41,7 @@ def battery_at(power, seconds, soc, battery):
 def imbalance_j(before, after, vehicle):
     """Chemical energy less everything it went into."""
     books = {name: getattr(after.energies, name) - getattr(before.energies, name) for name in after.energies._fields}
-    inertia, battery = vehicle.wheel.inertia_kgm2, vehicle.battery
+    inertia, battery = vehicle.front.wheel.inertia_kgm2, vehicle.battery
 
     def stored(state):
         kinetic = 0.5 * vehicle.chassis.mass_kg * state.speed_mps**2

@@ -14,11 +14,11 @@ TELLS_APART_W = 1e-3
 
 def split_w(force, speed, share, friction, slip_aware, vehicle):
     """Battery power for a road force at a share, and the force nobody can give."""
-    car, motor, radius = vehicle.chassis, vehicle.motor, vehicle.wheel.radius_m
+    car, motor, radius = vehicle.chassis, vehicle.front.motor, vehicle.front.wheel.radius_m
     rolling = speed / radius
     if force == 0.0:
         return battery_w(4.0 * electrical_w(0.0, rolling, motor), vehicle.battery), 0.0
-    mass = car.mass_kg + 4.0 * vehicle.wheel.inertia_kgm2 / radius**2
+    mass = car.mass_kg + 4.0 * vehicle.front.wheel.inertia_kgm2 / radius**2
     normal = normal_forces((force - road_load(speed, 0.0, car)) / mass, speed, 0.0, car)
     direction = 1.0 if force > 0.0 else -1.0
     asked = [share * force, force - share * force]
@@ -28,7 +28,7 @@ def split_w(force, speed, share, friction, slip_aware, vehicle):
             drag = motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * rolling
             asked[1 - idle] += 2.0 * drag / radius
     asked = [max(direction * x, 0.0) for x in asked]
-    room = [0.99 * 2.0 * friction * vehicle.tyre.peak_factor * n if slip_aware else 1e12 for n in normal]
+    room = [0.99 * 2.0 * friction * vehicle.front.tyre.peak_factor * n if slip_aware else 1e12 for n in normal]
     if direction > 0.0:
         room = [min(x, 2.0 * torque_limit(rolling, 0.0, motor) / radius) for x in room]
     given = [min(a, r) for a, r in zip(asked, room, strict=True)]
@@ -46,8 +46,8 @@ def cheapest(demand, speed, previous, friction, slip_aware, switching, vehicle, 
     rolling = max(speed, vehicle.driver.power_speed_floor_mps)
     force = demand / rolling
     if slip_aware:
-        used = min(abs(force) / (vehicle.chassis.mass_kg * G), 0.99 * friction * vehicle.tyre.peak_factor)
-        slip = slip_for(used, friction, vehicle.tyre)
+        used = min(abs(force) / (vehicle.chassis.mass_kg * G), 0.99 * friction * vehicle.front.tyre.peak_factor)
+        slip = slip_for(used, friction, vehicle.front.tyre)
         rim = speed / (1.0 - slip) if demand > 0.0 else speed * (1.0 - slip)
         force = demand / max(rim, vehicle.driver.power_speed_floor_mps)
 

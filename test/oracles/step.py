@@ -43,7 +43,7 @@ def dynamic_step(power, speed, slips, share, vehicle, problem):
 
     `slips` are those of front and rear. All four wheels turn, and nothing is gated or beyond a limit of the battery.
     """
-    car, wheel, tyre, motor = vehicle.chassis, vehicle.wheel, vehicle.tyre, vehicle.motor
+    car, wheel, tyre, motor = vehicle.chassis, vehicle.front.wheel, vehicle.front.tyre, vehicle.front.motor
     dt, radius = problem.dt_s, wheel.radius_m
     rim = [speed / (1.0 - s) if s > 0.0 else speed * (1.0 + s) for s in slips]
     before = [x / radius for x in rim]

@@ -351,7 +351,7 @@ def test_energy_of_a_constant_step_is_power_times_time(drive: Path) -> None:
         meter.add(measurement, (20.0,) * 4, (0.0, 0.0, -1.0, -1.0))
     found = meter.result()
     assert found.distance_m == pytest.approx(40.0)
-    assert found.electrical_wh == pytest.approx(4 * electrical_power_w(20.0, 30.0, car.motor) * 4.0 / 3600.0)
+    assert found.electrical_wh == pytest.approx(4 * electrical_power_w(20.0, 30.0, car.front.motor) * 4.0 / 3600.0)
     assert found.chemical_wh > found.electrical_wh
     assert found.friction_wh == pytest.approx(-2 * 30.0 * 4.0 / 3600.0)
     assert found.wheel_work_wh == pytest.approx((4 * 20.0 - 2.0) * 30.0 * 4.0 / 3600.0)

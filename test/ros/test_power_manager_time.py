@@ -11,8 +11,8 @@ import pytest
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.nodes import power_manager_config as config
-from iwm_power_manager.policy import empty_table
 from iwm_power_manager.ros import messages
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
@@ -95,7 +95,7 @@ class TestLockstep:
     def test_it_computes_the_same_bits_as_the_controller_without_ros(self, bench) -> None:
         vehicle = load_vehicle(resolve(Path("config/vehicles/jalalmaab_2015.yaml"))).params
         values = {spec.name: spec.default for spec in config.SPECS} | {"lockstep": True}
-        radius = vehicle.wheel.radius_m
+        radius = vehicle.front.wheel.radius_m
         limits = ControllerLimits(config.input_limits(values, radius), None, config.supervision_limits(values))
         twin = Controller(
             vehicle, messages.WHEEL_NAMES, limits, config.law_settings(values, "instantaneous_slip"), empty_table(), 0.9

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import GATE_MODE_LIMITER, GATE_MODE_OFF, default_settings, initial_state
 from iwm_power_manager.cycle import load_cycle, make_cycle
 from iwm_power_manager.model.driver import DriverState, drive, sample
 from iwm_power_manager.model.pedals import full_braking_w
 from iwm_power_manager.model.tyre import slip_ratio
-from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle, with_params
 from iwm_sim import closed_loop, plant
@@ -146,7 +146,9 @@ def stop(friction, gate_mode):
             car, command.motor_torque_nm, command.friction_torque_nm, 0.0, (friction,) * 4, dt, 1, params
         )
         if car.speed_mps > 1.0:
-            slips.append([slip_ratio(w, car.speed_mps, params.wheel.radius_m, 0.5) for w in car.wheel_speed_radps[1:3]])
+            slips.append(
+                [slip_ratio(w, car.speed_mps, params.front.wheel.radius_m, 0.5) for w in car.wheel_speed_radps[1:3]]
+            )
     return car.distance_m, np.array(slips)
 
 

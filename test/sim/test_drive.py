@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import default_settings, initial_state
 from iwm_power_manager.cycle import load_cycle, make_cycle
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import closed_loop
@@ -92,7 +92,7 @@ def test_the_pedal_alone_brakes_with_the_force_the_demand_stands_for(vehicle):
         drive.advance(NO_ERROR, NO_ERROR)
     sensors = drive.sense()
     torque = drive.pedal_brake_torque_nm()
-    power = sum(torque) / vehicle.params.wheel.radius_m * sensors.speed_mps
+    power = sum(torque) / vehicle.params.front.wheel.radius_m * sensors.speed_mps
     assert power == pytest.approx(sensors.power_demand_w)
     assert all(value < 0.0 for value in torque)
 

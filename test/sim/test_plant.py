@@ -20,13 +20,13 @@ CARS = {
     for name in ("none", "drag", "enabled")
 }
 CAR = CARS["none"]
-RADIUS = CAR.wheel.radius_m
+RADIUS = CAR.front.wheel.radius_m
 NOTHING = (0.0, 0.0, 0.0, 0.0)
 DRY = (0.9, 0.9, 0.9, 0.9)
 HELD = (-900.0, -900.0, -900.0, -900.0)
 
 #: Standing and idle, its four motors draw 10 kW: a constant load for the battery.
-LOADED = CARS["enabled"]._replace(motor=CARS["enabled"].motor._replace(loss_constant_w=2500.0))
+LOADED = CARS["enabled"].with_axles(motor=CARS["enabled"].front.motor._replace(loss_constant_w=2500.0))
 
 
 def four(x):
@@ -89,8 +89,8 @@ def test_a_pack_without_polarisation_is_a_source_behind_a_resistance():
 
 @given(st.floats(-300.0, 300.0), st.floats(0.0, 150.0), st.floats(0.0, 40.0), st.floats(0.0, 1.2))
 def test_a_motor_obeys_as_far_as_it_can(command, wheel, speed, heat):
-    low = -physics.regeneration_limit(wheel, speed, heat, CAR.motor)
-    high = physics.torque_limit(wheel, heat, CAR.motor)
+    low = -physics.regeneration_limit(wheel, speed, heat, CAR.front.motor)
+    high = physics.torque_limit(wheel, heat, CAR.front.motor)
     assert obeyed_torque_nm(command, wheel, speed, heat, CAR) == pytest.approx(min(max(command, low), high), abs=1e-9)
 
 

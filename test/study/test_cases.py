@@ -111,5 +111,5 @@ def test_a_cycle_shorter_than_two_steps_is_refused(tmp_path, equal):
 def test_changes_reach_the_numbers_they_name():
     params = cases.vehicle_of(VEHICLE, "none").params
     changed = cases.changed(params, [Change("motor", "loss_constant_w", 40.0)])
-    assert changed.motor.loss_constant_w == 40.0
-    assert changed._replace(motor=params.motor) == params
+    assert changed.front.motor.loss_constant_w == 40.0
+    assert changed.with_axles(motor=params.front.motor) == params

@@ -16,7 +16,7 @@ def car():
 
 def test_depletion_is_that_of_the_current_over_a_step(car):
     w = 10.0 / 0.33 / 0.99
-    power = 2.0 * sum(electrical_power_w(axle_w / (2.0 * w), w, car.motor) for axle_w in (2000.0, 3000.0))
+    power = 2.0 * sum(electrical_power_w(axle_w / (2.0 * w), w, car.front.motor) for axle_w in (2000.0, 3000.0))
     current = current_a(power, 72 * 3.3, car.battery.resistance_ohm)
     expected = 100.0 * current * 0.1 / (3600.0 * 200.0)
     assert sensitivity.depletion_percent(2000.0, 5000.0, 10.0, 0.01, 0.01, car) == pytest.approx(expected, rel=1e-12)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import yaml
 
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import make_cycle
 from iwm_power_manager.nodes import power_manager_config
-from iwm_power_manager.policy import empty_table
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import closed_loop, metrics, simulator

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from bags_helpers import write_drive
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.mdp.demand_counts import DemandCounter, save_transitions
 from iwm_power_manager.mdp.problem import load_problem
-from iwm_power_manager.policy import empty_table, load_policy
+from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools import solve_policy
 from iwm_power_manager.vehicle import load_vehicle

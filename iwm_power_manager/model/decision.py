@@ -1,0 +1,267 @@
+"""One decision: what it costs and where it leads. The physics of the optimisation problem.
+
+`step_cost_and_next` is the one kernel that the solver tabulates and that a one-step lookahead calls at run time. It
+holds no physics of its own: gate (Table 2), torque conversion and limits (eq. 16-20, 40-43) and the vehicle's motion
+(eq. 1-11) are `model`'s.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.battery import chemical_power_w
+from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
+from iwm_power_manager.model.gate import axle_gated, gated_split
+from iwm_power_manager.model.limits import battery_scale, car_power_w
+from iwm_power_manager.model.longitudinal import step
+from iwm_power_manager.model.motor import idle_drag_nm, torque_limit_nm
+from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
+from iwm_power_manager.model.torque import blend, conversion_speed_radps
+from iwm_power_manager.model.tyre import slip_ratio
+
+#: Where the delivered power is measured: torque times speed at the wheel (sees no power lost in slip), or at the
+
+#: road, where it moves the car.
+POWER_ERROR_WHEEL, POWER_ERROR_ROAD = range(2)
+POWER_ERRORS = {"wheel": POWER_ERROR_WHEEL, "road": POWER_ERROR_ROAD}
+
+#: What an error e (W, demanded minus delivered) costs per second, in W:
+
+#: squared alpha * e^2 / 1 kW; absolute alpha * |e|; lagrange alpha * e towards the demand, so that a surplus is
+
+#: credited: the multiplier of "deliver the demand on average".
+ERROR_SQUARED, ERROR_ABSOLUTE, ERROR_LAGRANGE = range(3)
+ERROR_NORMS = {"squared": ERROR_SQUARED, "absolute": ERROR_ABSOLUTE, "lagrange": ERROR_LAGRANGE}
+
+#: dynamic: slip is a state and obeys wheel rotation (eq. 11). quasi_steady: slip settles within a step at the value
+
+#: that carries the axle's force; slip is no state then.
+SLIP_DYNAMIC, SLIP_QUASI_STEADY = range(2)
+SLIP_MODELS = {"dynamic": SLIP_DYNAMIC, "quasi_steady": SLIP_QUASI_STEADY}
+
+#: Skid avoidance inside the problem (Table 2): none; an axle beyond the critical slip in braking gets no power;
+
+#: or in driving as well.
+SKID_NONE, SKID_BRAKING, SKID_BOTH = range(3)
+SKID_AVOIDANCE = {"none": SKID_NONE, "braking": SKID_BRAKING, "both": SKID_BOTH}
+
+
+class ProblemParams(NamedTuple):
+    """What the kernels need to know of the problem; all SI.
+
+    Attributes
+    ----------
+    dt_s : length of a decision step
+    friction : peak friction coefficient of the road
+    alpha : price of undelivered energy, J per J (squared: at an error of 1 kW)
+    power_error : POWER_ERROR_*
+    error_norm : ERROR_*
+    slip_model : SLIP_*
+    skid_avoidance : SKID_*
+    critical_slip : magnitude of slip beyond which an axle is gated
+    """
+
+    dt_s: float
+    friction: float
+    alpha: float
+    power_error: int
+    error_norm: int
+    slip_model: int
+    skid_avoidance: int
+    critical_slip: float
+
+
+#: A slip of 1 would be an infinite wheel speed; the state "spinning" stands for this one.
+SPINNING_SLIP = 0.95
+
+
+class Step(NamedTuple):
+    """Outcome of one decision step.
+
+    Attributes
+    ----------
+    cost_j : battery energy plus price of the power error, J; without switching cost
+    speed_mps, slip_front, slip_rear : at the end of the step
+    shortfall_w : part of the demand that limits of motors or battery kept from the wheels; 0 if the control is feasible
+    """
+
+    cost_j: float
+    speed_mps: float
+    slip_front: float
+    slip_rear: float
+    shortfall_w: float
+
+
+@kernel
+def axles_gated(power_w: float, slip_front: float, slip_rear: float, problem: ProblemParams) -> tuple[bool, bool]:
+    """Which axles Table 2 holds at zero power in this state."""
+    if problem.skid_avoidance == SKID_NONE:
+        return False, False
+    driving = problem.skid_avoidance == SKID_BOTH
+    return (
+        axle_gated(slip_front, power_w, False, problem.critical_slip, 0.0, driving),
+        axle_gated(slip_rear, power_w, False, problem.critical_slip, 0.0, driving),
+    )
+
+
+@kernel
+def wheel_speed_of_state(slip: float, speed_mps: float, vehicle: VehicleParams) -> float:
+    """Wheel speed, rad/s, at a slip as `tyre.slip_ratio` defines it, its floor at rest included."""
+    floor = vehicle.front.tyre.slip_speed_floor_mps
+    if slip > 0.0:
+        bounded = min(slip, SPINNING_SLIP)
+        rim = speed_mps / (1.0 - bounded)
+        if rim < floor:
+            rim = speed_mps + bounded * floor
+    else:
+        rim = max(speed_mps + slip * max(speed_mps, floor), 0.0)
+    return rim / vehicle.front.wheel.radius_m
+
+
+@kernel
+def error_cost_j(power_demand_w: float, delivered_w: float, problem: ProblemParams) -> float:
+    """Price of the difference between demand and delivered power during a step, J (alpha * M in eq. 28)."""
+    error = power_demand_w - delivered_w
+    if problem.error_norm == ERROR_SQUARED:
+        rate = error * error / 1000.0
+    elif problem.error_norm == ERROR_LAGRANGE:
+        rate = error if power_demand_w >= 0.0 else -error
+    else:
+        rate = abs(error)
+    return problem.alpha * rate * problem.dt_s
+
+
+@kernel
+def step_cost_and_next(
+    power_demand_w: float,
+    speed_mps: float,
+    slip_front: float,
+    slip_rear: float,
+    front_share: float,
+    vehicle: VehicleParams,
+    problem: ProblemParams,
+) -> Step:
+    """One decision step of `problem.dt_s` at a state under a front share.
+
+    An axle beyond the critical slip is gated first, whatever the share. Limits bind after that: what they cut off is
+    `shortfall_w`. Braking is never short: what regeneration cannot take, friction does.
+    """
+    if problem.slip_model == SLIP_QUASI_STEADY:
+        return _quasi_steady_step(power_demand_w, speed_mps, front_share, vehicle, problem)
+    return _dynamic_step(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
+
+
+@kernel
+def _axle_torque(
+    power_w: float, wheel_speed_radps: float, speed_mps: float, vehicle: VehicleParams, problem: ProblemParams
+) -> tuple[float, float, float]:
+    """Motor and friction torque of one wheel for its axle's power, and the axle's power beyond the motor's limit."""
+    conversion = conversion_speed_radps(wheel_speed_radps, speed_mps, problem.critical_slip, vehicle)
+    torque = 0.5 * power_w / conversion
+    if torque > 0.0:
+        limit = torque_limit_nm(wheel_speed_radps, 0.0, vehicle.front.motor)
+        if torque > limit:
+            return limit, 0.0, 2.0 * (torque - limit) * conversion
+        return torque, 0.0, 0.0
+    motor, friction = blend(torque, wheel_speed_radps, speed_mps, 0.0, vehicle)
+    return motor, max(friction, -vehicle.front.friction_brake.max_torque_nm), 0.0
+
+
+@kernel
+def _dynamic_step(
+    power_demand_w: float,
+    speed_mps: float,
+    slip_front: float,
+    slip_rear: float,
+    front_share: float,
+    vehicle: VehicleParams,
+    problem: ProblemParams,
+) -> Step:
+    radius = vehicle.front.wheel.radius_m
+    motor = vehicle.front.motor
+    battery = vehicle.battery
+    dt = problem.dt_s
+    gate_front, gate_rear = axles_gated(power_demand_w, slip_front, slip_rear, problem)
+    power_front, power_rear = gated_split(power_demand_w, front_share, gate_front, gate_rear)
+    front_speed = wheel_speed_of_state(slip_front, speed_mps, vehicle)
+    rear_speed = wheel_speed_of_state(slip_rear, speed_mps, vehicle)
+
+    front_motor, front_friction, front_short = _axle_torque(power_front, front_speed, speed_mps, vehicle, problem)
+    rear_motor, rear_friction, rear_short = _axle_torque(power_rear, rear_speed, speed_mps, vehicle, problem)
+    shortfall = front_short + rear_short
+    scale = battery_scale(
+        front_motor, rear_motor, front_speed, rear_speed, battery.discharge_limit_w, battery.charge_limit_w, motor
+    )
+    if scale < 1.0:
+        cut_front = (1.0 - scale) * front_motor
+        cut_rear = (1.0 - scale) * rear_motor
+        front_motor -= cut_front
+        rear_motor -= cut_rear
+        if power_demand_w < 0.0:
+            front_friction = max(front_friction + cut_front, -vehicle.front.friction_brake.max_torque_nm)
+            rear_friction = max(rear_friction + cut_rear, -vehicle.front.friction_brake.max_torque_nm)
+        else:
+            shortfall += 2.0 * (cut_front * front_speed + cut_rear * rear_speed)
+
+    drag_front = idle_drag_nm(front_motor, front_speed, motor)
+    drag_rear = idle_drag_nm(rear_motor, rear_speed, motor)
+    resisting_front = drag_front - front_friction
+    resisting_rear = drag_rear - rear_friction
+    motion = step(
+        speed_mps,
+        (front_speed, front_speed, rear_speed, rear_speed),
+        0.0,
+        (front_motor, front_motor, rear_motor, rear_motor),
+        (resisting_front, resisting_front, resisting_rear, resisting_rear),
+        0.0,
+        (problem.friction, problem.friction, problem.friction, problem.friction),
+        dt,
+        vehicle,
+    )
+    # Constant torques and forces over the step: their work is exact with the mean of the speeds before and after it.
+    front_mean = 0.5 * (front_speed + motion.wheel_speed_radps[0])
+    rear_mean = 0.5 * (rear_speed + motion.wheel_speed_radps[2])
+    speed_mean = 0.5 * (speed_mps + motion.speed_mps)
+    electrical = car_power_w(front_motor, rear_motor, front_mean, rear_mean, motor)
+    if problem.power_error == POWER_ERROR_WHEEL:
+        front_brake = max(motion.resisting_torque_nm[0] - drag_front, 0.0)
+        rear_brake = max(motion.resisting_torque_nm[2] - drag_rear, 0.0)
+        delivered = 2.0 * ((front_motor - front_brake) * front_mean + (rear_motor - rear_brake) * rear_mean)
+    else:
+        # Work of the tyres on the car, plus what the inertia of rolling wheels takes: without slip, this is exactly
+        # the power at the wheels.
+        inertia_force = (equivalent_mass_kg(vehicle) - vehicle.chassis.mass_kg) * (motion.speed_mps - speed_mps) / dt
+        delivered = (2.0 * (motion.tyre_force_n[0] + motion.tyre_force_n[2]) + inertia_force) * speed_mean
+    floor = vehicle.front.tyre.slip_speed_floor_mps
+    return Step(
+        chemical_power_w(electrical, battery) * dt + error_cost_j(power_demand_w, delivered, problem),
+        motion.speed_mps,
+        slip_ratio(motion.wheel_speed_radps[0], motion.speed_mps, radius, floor),
+        slip_ratio(motion.wheel_speed_radps[2], motion.speed_mps, radius, floor),
+        shortfall,
+    )
+
+
+@kernel
+def _quasi_steady_step(
+    power_demand_w: float, speed_mps: float, front_share: float, vehicle: VehicleParams, problem: ProblemParams
+) -> Step:
+    battery = vehicle.battery
+    dt = problem.dt_s
+    force = demand_force_n(power_demand_w, speed_mps, problem.friction, True, vehicle)
+    power, missing = split_power_w(force, speed_mps, front_share, problem.friction, True, vehicle)
+    shortfall = 0.0
+    if power_demand_w > 0.0:
+        shortfall = missing * speed_mps + max(power - chemical_power_w(battery.discharge_limit_w, battery), 0.0)
+        given = force - missing
+    else:
+        power = max(power, chemical_power_w(-battery.charge_limit_w, battery))
+        given = force + missing
+    resistance = road_load_n(speed_mps, 0.0, vehicle.chassis)
+    after = max(speed_mps + dt * (given - resistance) / equivalent_mass_kg(vehicle), 0.0)
+    # What is missing at rest still counts: a car that cannot pull away has not delivered its demand.
+    rolling = max(speed_mps, vehicle.driver.power_speed_floor_mps)
+    error = error_cost_j(force * rolling, given * rolling, problem)
+    return Step(power * dt + error, after, 0.0, 0.0, shortfall)
