@@ -91,7 +91,7 @@ class Policy:
     checksum: str
 
     def check_vehicle(self, vehicle: Vehicle, name: str = "policy") -> None:
-        """Raise `PolicyError` unless this policy was solved for exactly this car (any change of a number counts)."""
+        """Raise `PolicyError` unless this policy was solved for this car: for every number the decision model reads."""
         if self.vehicle_hash != vehicle.hash:
             raise PolicyError(
                 f"{name}: was solved for '{self.vehicle_name}' ({self.vehicle_hash}, idle_drive {self.idle_drive}), "

@@ -15,6 +15,7 @@ import numpy as np
 from iwm_power_manager import files
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.parameters import (
+    IDLE_DRAG,
     IDLE_DRIVES,
     Axle,
     Battery,
@@ -41,7 +42,7 @@ class Vehicle:
     path : the file it came from
     idle_drive : "none", "drag" or "enabled"
     params : the numbers for the kernels
-    hash : 16 hex digits over every number a policy depends on; two files with the same numbers have the same hash
+    hash : 16 hex digits over every number the decision model reads: what a policy belongs to
     """
 
     name: str
@@ -56,9 +57,12 @@ class _Range(NamedTuple):
     high: float
     unit: str = ""
     above: bool = False  # low itself is excluded
+    decides: bool = True  # the decision model reads it (`model.decision` and what it calls): a policy depends on it
 
 
-# Ranges wide enough for anything from a pedal car to a truck, narrow enough to catch a wrong unit.
+# Ranges wide enough for anything from a pedal car to a truck, narrow enough to catch a wrong unit. What only the plant,
+# the driver or the law's derating reads is marked `decides=False`: a policy does not depend on it. A test turns each
+# number and compares what the solver tabulates.
 _RANGES: dict[str, dict[str, _Range]] = {
     "chassis": {
         "mass_kg": _Range(50, 50e3, "kg"),
@@ -84,8 +88,8 @@ _RANGES: dict[str, dict[str, _Range]] = {
     "motor": {
         "max_power_w": _Range(1, 1e6, "W"),
         "peak_torque_nm": _Range(1, 20e3, "N m"),
-        "continuous_torque_nm": _Range(1, 20e3, "N m"),
-        "thermal_time_constant_s": _Range(0.1, 1e5, "s"),
+        "continuous_torque_nm": _Range(1, 20e3, "N m", decides=False),
+        "thermal_time_constant_s": _Range(0.1, 1e5, "s", decides=False),
         "regeneration_torque_nm": _Range(0, 20e3, "N m"),
         "regeneration_full_above_mps": _Range(0, 50, "m/s"),
         "regeneration_zero_below_mps": _Range(0, 50, "m/s"),
@@ -103,29 +107,29 @@ _RANGES: dict[str, dict[str, _Range]] = {
     "friction_brake": {"max_torque_nm": _Range(0, 1e5, "N m")},
     "battery": {
         "cells_in_series": _Range(1, 1000),
-        "capacity_ah": _Range(0, 1e4, "Ah", True),
+        "capacity_ah": _Range(0, 1e4, "Ah", True, decides=False),
         "nominal_cell_voltage_v": _Range(0.5, 6, "V"),
         "resistance_ohm": _Range(0, 10, "ohm", True),
         "discharge_limit_w": _Range(0, 5e6, "W"),
         "charge_limit_w": _Range(0, 5e6, "W"),
-        "charge_full_below_soc": _Range(0, 1),
-        "charge_zero_above_soc": _Range(0, 1),
-        "discharge_full_above_soc": _Range(0, 1),
-        "discharge_zero_below_soc": _Range(0, 1),
-        "charge_full_above_degc": _Range(-50, 100, "degC"),
-        "charge_zero_below_degc": _Range(-50, 100, "degC"),
-        "power_full_below_degc": _Range(-50, 150, "degC"),
-        "power_zero_above_degc": _Range(-50, 150, "degC"),
-        "ohmic_resistance_ohm": _Range(0, 10, "ohm", True),
-        "ohmic_factor_at_10_percent": _Range(1, 10),
-        "polarisation_resistance_ohm": _Range(0, 10, "ohm"),
-        "polarisation_time_constant_s": _Range(1e-3, 1e5, "s"),
+        "charge_full_below_soc": _Range(0, 1, decides=False),
+        "charge_zero_above_soc": _Range(0, 1, decides=False),
+        "discharge_full_above_soc": _Range(0, 1, decides=False),
+        "discharge_zero_below_soc": _Range(0, 1, decides=False),
+        "charge_full_above_degc": _Range(-50, 100, "degC", decides=False),
+        "charge_zero_below_degc": _Range(-50, 100, "degC", decides=False),
+        "power_full_below_degc": _Range(-50, 150, "degC", decides=False),
+        "power_zero_above_degc": _Range(-50, 150, "degC", decides=False),
+        "ohmic_resistance_ohm": _Range(0, 10, "ohm", True, decides=False),
+        "ohmic_factor_at_10_percent": _Range(1, 10, decides=False),
+        "polarisation_resistance_ohm": _Range(0, 10, "ohm", decides=False),
+        "polarisation_time_constant_s": _Range(1e-3, 1e5, "s", decides=False),
     },
     "driver": {
-        "preview_s": _Range(0, 5, "s"),
-        "proportional_n_per_mps": _Range(0, 1e6, "N s/m"),
-        "integral_n_per_m": _Range(0, 1e6, "N/m"),
-        "full_brake_g": _Range(0.05, 2, "g"),
+        "preview_s": _Range(0, 5, "s", decides=False),
+        "proportional_n_per_mps": _Range(0, 1e6, "N s/m", decides=False),
+        "integral_n_per_m": _Range(0, 1e6, "N/m", decides=False),
+        "full_brake_g": _Range(0.05, 2, "g", decides=False),
         "power_speed_floor_mps": _Range(0.05, 5, "m/s"),
     },
 }
@@ -140,6 +144,7 @@ _ORDERED = (
     ("battery", "power_full_below_degc", "power_zero_above_degc", False),
 )
 
+_IDLE_DRAG_KEYS = {"idle_standby_w", "idle_drag_constant_nm", "idle_drag_linear_nm_per_radps"}
 _OCV_KEYS = ("ocv_soc", "ocv_cell_v")
 _LOSS_FIELDS = dict(
     zip(
@@ -372,25 +377,31 @@ def _continue_losses(path: Path, speeds: FloatArray, torques: FloatArray, loss: 
 
 
 def _hash(params: VehicleParams) -> str:
-    """Hash over every number a policy depends on: all but the simulated driver's, of which it knows the speed floor."""
+    """Hash over every number of both axles that the decision model reads, and nothing else."""
+    content = {
+        "chassis": _decisive("chassis", params.chassis),
+        "battery": _decisive("battery", params.battery),
+        "driver": _decisive("driver", params.driver),
+        "front": {part: _decisive(part, values) for part, values in params.front._asdict().items()},
+        "rear": {part: _decisive(part, values) for part, values in params.rear._asdict().items()},
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _decisive(section: str, values: Any) -> dict[str, Any]:
+    """The numbers of a section that a decision depends on, exactly, by name."""
+    kept = {key for key, r in _RANGES[section].items() if r.decides}
+    if section == "motor":
+        # Where an idle motor does not drag, nobody asks what its drag would be.
+        kept -= set() if values.idle_drive == IDLE_DRAG else _IDLE_DRAG_KEYS
+        kept |= {"idle_drive", *_LOSS_FIELDS.values(), *(name for name in values._fields if name.startswith("map_"))}
 
     def plain(value: Any) -> Any:
         if isinstance(value, np.ndarray):
             return [float(x).hex() for x in value.ravel()]
         return float(value).hex() if isinstance(value, float) else value
 
-    def section(values: Any) -> dict[str, Any]:
-        return {field: plain(value) for field, value in values._asdict().items()}
-
-    content: dict[str, Any] = {"chassis": section(params.chassis), "battery": section(params.battery)}
-    axles = {
-        name: {part: section(values) for part, values in axle._asdict().items()}
-        for name, axle in (("front", params.front), ("rear", params.rear))
-    }
-    # Equal axles count once, so that a car written with one section for both keeps its identity.
-    content |= axles["front"] if axles["front"] == axles["rear"] else axles
-    content["driver"] = {"power_speed_floor_mps": plain(params.driver.power_speed_floor_mps)}
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+    return {name: plain(value) for name, value in values._asdict().items() if name in kept}
 
 
 def nominal_voltage_v(battery: Battery) -> float:

@@ -219,7 +219,7 @@ def test_the_paper_s_car_has_the_paper_s_numbers():
 
 
 @pytest.mark.parametrize("path", NUMBERS, ids=".".join)
-def test_every_number_of_the_file_arrives_in_the_parameters_and_counts_for_the_car_s_identity(path, monkeypatch):
+def test_every_number_of_the_file_arrives_in_the_parameters(path, monkeypatch):
     section, key = path[0], path[-1]
     before = load_vehicle(PAPER)
     value = CONTENT[section]["loss"][key] if "loss" in path else CONTENT[section][key]
@@ -231,8 +231,6 @@ def test_every_number_of_the_file_arrives_in_the_parameters_and_counts_for_the_c
     different = [name for name, x in old.items() if not np.array_equal(x, new[name])]
     assert len(different) == 1
     assert different[0] == key or "loss" in path
-    # Of the simulated driver, a policy knows only where eq. 16 stops dividing by the speed.
-    assert (before.hash == after.hash) == (section == "driver" and key != "power_speed_floor_mps")
 
 
 def test_idle_drive_can_be_replaced():
