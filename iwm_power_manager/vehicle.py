@@ -14,6 +14,7 @@ import numpy as np
 
 from iwm_power_manager import files
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.model import tyre
 from iwm_power_manager.model.parameters import (
     IDLE_DRAG,
     IDLE_DRIVES,
@@ -78,13 +79,7 @@ _RANGES: dict[str, dict[str, _Range]] = {
         "radius_m": _Range(0.05, 2, "m"),
         "inertia_kgm2": _Range(1e-3, 200, "kg m2"),
     },
-    "tyre": {
-        "stiffness_factor": _Range(1, 100),
-        "shape_factor": _Range(1, 3),
-        "peak_factor": _Range(0.1, 2),
-        "curvature_factor": _Range(-10, 1),
-        "slip_speed_floor_mps": _Range(1e-3, 5, "m/s"),
-    },
+    "tyre": {"slip_speed_floor_mps": _Range(1e-3, 5, "m/s")},
     "motor": {
         "max_power_w": _Range(1, 1e6, "W"),
         "peak_torque_nm": _Range(1, 20e3, "N m"),
@@ -187,7 +182,9 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
         drive = files.check_choice("idle_drive override", "idle_drive", idle_drive, IDLE_DRIVES)
 
     motor = _motor(path, content["motor"], drive)
-    numbers = {name: _numbers(path, name, content[name]) for name in sections if name not in ("motor", "battery")}
+    numbers = {
+        name: _numbers(path, name, content[name]) for name in sections if name not in ("tyre", "motor", "battery")
+    }
     battery = _battery(path, content["battery"])
     for section, small, large, may_equal in _ORDERED:
         low, high = content[section][small], content[section][large]
@@ -196,7 +193,7 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
             raise ConfigError(path, f"{section}.{large}", f"{high} is out of range", f"{relation} {small} = {low}")
     axle = Axle(
         wheel=Wheel(**numbers["wheel"]),
-        tyre=Tyre(**numbers["tyre"]),
+        tyre=_tyre(path, content["tyre"]),
         motor=motor,
         friction_brake=FrictionBrake(**numbers["friction_brake"]),
     )
@@ -234,6 +231,21 @@ def _numbers(path: Path, section: str, mapping: Any, optional: tuple[str, ...] =
         key: files.check_number(path, f"{section}.{key}", mapping[key], r.low, r.high, above=r.above, unit=r.unit)
         for key, r in ranges.items()
     }
+
+
+def _tyre(path: Path, mapping: Any) -> Tyre:
+    """The tyre section: the keys of the model it names (`tyre.DEFAULT` if it names none), and the slip's floor."""
+    name = mapping.get("model", tyre.DEFAULT) if isinstance(mapping, dict) else tyre.DEFAULT
+    ranges = tyre.MODELS[files.check_choice(path, "tyre.model", name, tyre.MODELS)].ranges
+    floor = _RANGES["tyre"]["slip_speed_floor_mps"]
+    files.check_keys(path, mapping, (*ranges, "slip_speed_floor_mps"), ("model",), "tyre")
+    values = {
+        key: files.check_number(path, f"tyre.{key}", mapping[key], low, high) for key, (low, high) in ranges.items()
+    }
+    speed = files.check_number(
+        path, "tyre.slip_speed_floor_mps", mapping["slip_speed_floor_mps"], floor.low, floor.high, unit=floor.unit
+    )
+    return tyre.make(name, values, speed)
 
 
 def _motor(path: Path, mapping: Any, drive: str) -> Motor:
@@ -401,6 +413,11 @@ def _decisive(section: str, values: Any) -> dict[str, Any]:
             return [float(x).hex() for x in value.ravel()]
         return float(value).hex() if isinstance(value, float) else value
 
+    if isinstance(values, Tyre):
+        model, coefficients = tyre.numbers(values)
+        named = {} if model == tyre.DEFAULT else {"model": model}
+        numbers = coefficients | {"slip_speed_floor_mps": values.slip_speed_floor_mps}
+        return named | {name: plain(value) for name, value in numbers.items()}
     return {name: plain(value) for name, value in values._asdict().items() if name in kept}
 
 

@@ -71,6 +71,10 @@ def _numbers(params):
 def _turned(values, name):
     """The section with one number a little different."""
     value = getattr(values, name)
+    if name == "model":
+        return values._replace(model=1)
+    if name == "coefficients":
+        return values._replace(coefficients=tuple(0.9 * x for x in value))
     if name == "idle_drive":
         return values._replace(idle_drive=(value + 1) % 3)
     if isinstance(value, np.ndarray):

@@ -50,6 +50,8 @@ def normal_forces_n(acceleration_mps2: float, speed_mps: float, grade: float, ch
 
 @kernel
 def equivalent_mass_kg(vehicle: VehicleParams) -> float:
-    """Mass that accelerates, wheels' rotation included: m + 4 I / r^2."""
-    radius = vehicle.front.wheel.radius_m
-    return vehicle.chassis.mass_kg + 4.0 * vehicle.front.wheel.inertia_kgm2 / (radius * radius)
+    """Mass that accelerates, wheels' rotation included: m + the sum of I / r^2."""
+    front = vehicle.front.wheel
+    rear = vehicle.rear.wheel
+    turning = 2.0 * front.inertia_kgm2 / (front.radius_m * front.radius_m)
+    return vehicle.chassis.mass_kg + (turning + 2.0 * rear.inertia_kgm2 / (rear.radius_m * rear.radius_m))

@@ -19,9 +19,10 @@ from typing import NamedTuple
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n, rolling_force_n
-from iwm_power_manager.model.parameters import Tyre, VehicleParams, Wheel
-from iwm_power_manager.model.tyre import friction_and_slope, friction_coefficient, slip_ratio
+from iwm_power_manager.model.parameters import Axle, Tyre, VehicleParams, Wheel
+from iwm_power_manager.model.tyre import friction_and_slope, friction_coefficient, peak_ratio, slip_ratio
 
+Two = tuple[float, float]  # left, right
 Four = tuple[float, float, float, float]  # front_left, front_right, rear_left, rear_right
 
 
@@ -66,7 +67,7 @@ def wheel_step(
     radius = wheel.radius_m
     inertia_rate = wheel.inertia_kgm2 / dt_s
     torque = motor_torque_nm - resisting_torque_nm
-    reach = radius * abs(friction) * tyre.peak_factor * normal_force_n / inertia_rate
+    reach = radius * abs(friction) * peak_ratio(tyre) * normal_force_n / inertia_rate
     free = wheel_speed_radps + torque / inertia_rate
     low = free - reach
     high = free + reach
@@ -104,6 +105,61 @@ def wheel_step(
 
 
 @kernel
+def axle_step(
+    wheel_speed_radps: Two,
+    motor_torque_nm: Two,
+    resisting_torque_nm: Two,
+    friction: Two,
+    speed_after_mps: float,
+    normal_force_n: float,
+    dt_s: float,
+    axle: Axle,
+) -> tuple[Two, Two, Two]:
+    """`wheel_step` for the left and the right wheel of an axle; wheels that are alike are solved once.
+
+    Returns
+    -------
+    wheel speeds after the step (rad/s), tyre forces (N), torques the brakes really exerted (N m)
+    """
+    w, f, b = wheel_step(
+        wheel_speed_radps[0],
+        speed_after_mps,
+        motor_torque_nm[0],
+        resisting_torque_nm[0],
+        normal_force_n,
+        friction[0],
+        dt_s,
+        axle.wheel,
+        axle.tyre,
+    )
+    if (
+        wheel_speed_radps[0] == wheel_speed_radps[1]
+        and motor_torque_nm[0] == motor_torque_nm[1]
+        and resisting_torque_nm[0] == resisting_torque_nm[1]
+        and friction[0] == friction[1]
+    ):
+        return (w, w), (f, f), (b, b)
+    w1, f1, b1 = wheel_step(
+        wheel_speed_radps[1],
+        speed_after_mps,
+        motor_torque_nm[1],
+        resisting_torque_nm[1],
+        normal_force_n,
+        friction[1],
+        dt_s,
+        axle.wheel,
+        axle.tyre,
+    )
+    return (w, w1), (f, f1), (b, b1)
+
+
+@kernel
+def _inertia_ratio(axle: Axle, mass_kg: float) -> float:
+    """Inertia of an axle's two wheels, as a mass at the rim, over the car's mass."""
+    return 2.0 * axle.wheel.inertia_kgm2 / (axle.wheel.radius_m * axle.wheel.radius_m * mass_kg)
+
+
+@kernel
 def step(
     speed_mps: float,
     wheel_speed_radps: Four,
@@ -128,53 +184,45 @@ def step(
     dt_s : step, > 0
     """
     chassis = vehicle.chassis
-    wheel = vehicle.front.wheel
-    tyre = vehicle.front.tyre
     mass = chassis.mass_kg
     # A change of the car's speed drags the wheels' inertia along: the known slope makes the iteration a Newton step.
-    coupling = 1.0 + 4.0 * wheel.inertia_kgm2 / (wheel.radius_m * wheel.radius_m * mass)
+    coupling = 1.0 + (_inertia_ratio(vehicle.front, mass) + _inertia_ratio(vehicle.rear, mass))
     grade_force = grade_force_n(grade, chassis)
     rolling_drop = rolling_force_n(grade, chassis) * dt_s / mass
-    mirrored_front = (
-        wheel_speed_radps[0] == wheel_speed_radps[1]
-        and motor_torque_nm[0] == motor_torque_nm[1]
-        and resisting_torque_nm[0] == resisting_torque_nm[1]
-        and friction[0] == friction[1]
-    )
-    mirrored_rear = (
-        wheel_speed_radps[2] == wheel_speed_radps[3]
-        and motor_torque_nm[2] == motor_torque_nm[3]
-        and resisting_torque_nm[2] == resisting_torque_nm[3]
-        and friction[2] == friction[3]
-    )
-    before = wheel_speed_radps
-    driving = motor_torque_nm
-    resisting = resisting_torque_nm
     after = max(speed_mps + acceleration_mps2 * dt_s, 0.0)
-    w0, f0, b0 = 0.0, 0.0, 0.0
-    w1, f1, b1 = 0.0, 0.0, 0.0
-    w2, f2, b2 = 0.0, 0.0, 0.0
-    w3, f3, b3 = 0.0, 0.0, 0.0
-    moved = after
-    coasting = after
-    drag = 0.0
     # The faster the car is assumed to be, the more the tyres slow it: the root lies between what was too slow and what
     # was too fast. Without the bracket the iteration would swing about a car that locked wheels bring to rest.
     low = 0.0
     high = math.inf
     last_change = math.inf
+    front = rear = ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+    moved = after
+    coasting = after
     for _ in range(60):
-        front, rear = normal_forces_n((after - speed_mps) / dt_s, after, grade, chassis)
-        w0, f0, b0 = wheel_step(before[0], after, driving[0], resisting[0], front, friction[0], dt_s, wheel, tyre)
-        w1, f1, b1 = w0, f0, b0
-        if not mirrored_front:
-            w1, f1, b1 = wheel_step(before[1], after, driving[1], resisting[1], front, friction[1], dt_s, wheel, tyre)
-        w2, f2, b2 = wheel_step(before[2], after, driving[2], resisting[2], rear, friction[2], dt_s, wheel, tyre)
-        w3, f3, b3 = w2, f2, b2
-        if not mirrored_rear:
-            w3, f3, b3 = wheel_step(before[3], after, driving[3], resisting[3], rear, friction[3], dt_s, wheel, tyre)
+        front_n, rear_n = normal_forces_n((after - speed_mps) / dt_s, after, grade, chassis)
+        front = axle_step(
+            wheel_speed_radps[:2],
+            motor_torque_nm[:2],
+            resisting_torque_nm[:2],
+            friction[:2],
+            after,
+            front_n,
+            dt_s,
+            vehicle.front,
+        )
+        rear = axle_step(
+            wheel_speed_radps[2:],
+            motor_torque_nm[2:],
+            resisting_torque_nm[2:],
+            friction[2:],
+            after,
+            rear_n,
+            dt_s,
+            vehicle.rear,
+        )
         drag = aerodynamic_force_n(after, chassis)
-        coasting = speed_mps + dt_s / mass * (f0 + f1 + f2 + f3 - drag - grade_force)
+        tyres = front[1][0] + front[1][1] + rear[1][0] + rear[1][1]
+        coasting = speed_mps + dt_s / mass * (tyres - drag - grade_force)
         moved = max(coasting - rolling_drop, 0.0)
         change = moved - after
         if abs(change) <= 1e-10 * (1.0 + moved):
@@ -187,4 +235,10 @@ def step(
         if high < math.inf and (not low < after < high or abs(change) > 0.5 * last_change):
             after = 0.5 * (low + high)
         last_change = abs(change)
-    return Motion(moved, (w0, w1, w2, w3), (f0, f1, f2, f3), (b0, b1, b2, b3), (coasting - moved) * mass / dt_s)
+    return Motion(
+        speed_mps=moved,
+        wheel_speed_radps=front[0] + rear[0],
+        tyre_force_n=front[1] + rear[1],
+        resisting_torque_nm=front[2] + rear[2],
+        rolling_force_n=(coasting - moved) * mass / dt_s,
+    )

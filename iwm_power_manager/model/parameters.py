@@ -38,13 +38,15 @@ class Wheel(NamedTuple):
     inertia_kgm2: float
 
 
-class Tyre(NamedTuple):
-    """Magic Formula (eq. 9) and the regularisation of slip at rest (eq. 10)."""
+#: As many numbers as any tyre model has; what they mean only its module in `model/tyre/` knows.
+TyreCoefficients = tuple[float, float, float, float]
 
-    stiffness_factor: float
-    shape_factor: float
-    peak_factor: float
-    curvature_factor: float
+
+class Tyre(NamedTuple):
+    """A tyre model with its numbers (`model.tyre`), and the regularisation of slip at rest (eq. 10)."""
+
+    model: int
+    coefficients: TyreCoefficients
     slip_speed_floor_mps: float
 
 

@@ -13,7 +13,7 @@ from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, normal_forces_n, road_load_n
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import VehicleParams
-from iwm_power_manager.model.tyre import slip_at_friction, wheel_speed_at_slip
+from iwm_power_manager.model.tyre import peak_ratio, slip_at_friction, wheel_speed_at_slip
 
 #: Part of the peak friction a strategy plans with. The rest is the distance the slip limiter keeps from the peak.
 USABLE_FRICTION = 0.99
@@ -81,7 +81,7 @@ def split_power_w(
     room_front = 1e12
     room_rear = 1e12
     if slip_aware:
-        grip = 2.0 * USABLE_FRICTION * friction * vehicle.front.tyre.peak_factor
+        grip = 2.0 * USABLE_FRICTION * friction * peak_ratio(vehicle.front.tyre)
         room_front = grip * normal_front
         room_rear = grip * normal_rear
     if sign > 0.0:
@@ -113,7 +113,7 @@ def demand_force_n(
     if not slip_aware:
         return force
     used = force / (vehicle.chassis.mass_kg * GRAVITY_MPS2)
-    most = USABLE_FRICTION * friction * vehicle.front.tyre.peak_factor
+    most = USABLE_FRICTION * friction * peak_ratio(vehicle.front.tyre)
     slip = slip_at_friction(min(max(used, -most), most), friction, vehicle.front.tyre)
     rim_speed = vehicle.front.wheel.radius_m * wheel_speed_at_slip(slip, speed_mps, vehicle.front.wheel.radius_m)
     return power_demand_w / max(rim_speed, floor)

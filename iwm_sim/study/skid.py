@@ -12,7 +12,7 @@ from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import GATE_MODES, STRATEGIES, default_settings, initial_state
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.parameters import VehicleParams
-from iwm_power_manager.model.tyre import slip_ratio
+from iwm_power_manager.model.tyre import friction_coefficient, slip_ratio
 from iwm_sim import closed_loop, plant
 from iwm_sim.metrics import CRITICAL_SLIP, MOVING_MPS, longest_s
 from iwm_sim.study import cases
@@ -43,15 +43,13 @@ class Stop(NamedTuple):
 def best_stop_m(friction: float, from_mps: float, vehicle: VehicleParams) -> tuple[float, float]:
     """Shortest stop with all wheels held at one slip, and that slip.
 
-    Written down anew from eq. 1, 3, 4, 6 and 9, without the kernels of the model: at a constant slip s every wheel
+    Written down anew from eq. 1, 3, 4 and 6, without the kernels of the motion: at a constant slip s every wheel
     gives mu(s) of its load, the loads sum up to the weight, so the deceleration is g (mu(s) + c_rr) + k v^2 and the
     distance its closed integral.
     """
-    tyre, chassis = vehicle.front.tyre, vehicle.chassis
+    chassis = vehicle.chassis
     slip = np.linspace(1e-3, 1.0, 5000)
-    x = tyre.stiffness_factor * slip
-    angle = tyre.shape_factor * np.arctan(x - tyre.curvature_factor * (x - np.arctan(x)))
-    used = friction * tyre.peak_factor * np.sin(angle)
+    used = np.array([friction_coefficient(s, friction, vehicle.front.tyre) for s in slip])
     steady = GRAVITY_MPS2 * (used + chassis.rolling_resistance)
     air = 0.5 * chassis.air_density_kgpm3 * chassis.frontal_area_m2 * chassis.drag_coefficient / chassis.mass_kg
     distance = np.log1p(air * from_mps**2 / steady) / (2.0 * air)

@@ -57,7 +57,8 @@ def test_without_slip_the_power_at_the_road_is_the_power_at_the_wheels():
     vehicle = load_vehicle(CAR.path, "none").params
 
     def lost_j(stiffness):
-        car = vehicle.with_axles(tyre=vehicle.front.tyre._replace(stiffness_factor=stiffness))
+        tyre = vehicle.front.tyre
+        car = vehicle.with_axles(tyre=tyre._replace(coefficients=(stiffness, *tyre.coefficients[1:])))
         params = [_params(power_error=where, error_norm="lagrange", alpha=1.0) for where in ("road", "wheel")]
         road, wheel = (step_cost_and_next(5000.0, 15.0, 0.0, 0.0, 0.5, car, p).cost_j for p in params)
         return road - wheel

@@ -81,7 +81,7 @@ def test_a_demand_stands_for_a_force_at_no_less_than_the_floor_speed():
 @given(st.floats(-20e3, 20e3), st.floats(2.0, 40.0), st.sampled_from([0.9, 0.5, 0.2]))
 def test_a_demand_s_force_is_that_of_wheels_that_slip_for_it(power, speed, friction):
     force = demand_force_n(power, speed, friction, True, CAR)
-    peak = friction * CAR.front.tyre.peak_factor
+    peak = friction * CAR.front.tyre.coefficients[2]
     used = min(abs(power) / speed / (800.0 * 9.81), 0.99 * peak)
     slip = math.copysign(slip_for(used, friction, CAR.front.tyre), power)
     rim = speed / (1.0 - slip) if power > 0.0 else speed * (1.0 + slip)

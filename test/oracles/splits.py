@@ -28,7 +28,7 @@ def split_w(force, speed, share, friction, slip_aware, vehicle):
             drag = motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * rolling
             asked[1 - idle] += 2.0 * drag / radius
     asked = [max(direction * x, 0.0) for x in asked]
-    room = [0.99 * 2.0 * friction * vehicle.front.tyre.peak_factor * n if slip_aware else 1e12 for n in normal]
+    room = [0.99 * 2.0 * friction * vehicle.front.tyre.coefficients[2] * n if slip_aware else 1e12 for n in normal]
     if direction > 0.0:
         room = [min(x, 2.0 * torque_limit(rolling, 0.0, motor) / radius) for x in room]
     given = [min(a, r) for a, r in zip(asked, room, strict=True)]
@@ -46,7 +46,7 @@ def cheapest(demand, speed, previous, friction, slip_aware, switching, vehicle, 
     rolling = max(speed, vehicle.driver.power_speed_floor_mps)
     force = demand / rolling
     if slip_aware:
-        used = min(abs(force) / (vehicle.chassis.mass_kg * G), 0.99 * friction * vehicle.front.tyre.peak_factor)
+        used = min(abs(force) / (vehicle.chassis.mass_kg * G), 0.99 * friction * vehicle.front.tyre.coefficients[2])
         slip = slip_for(used, friction, vehicle.front.tyre)
         rim = speed / (1.0 - slip) if demand > 0.0 else speed * (1.0 - slip)
         force = demand / max(rim, vehicle.driver.power_speed_floor_mps)

@@ -11,7 +11,7 @@ G = 9.81
 
 
 def friction_coefficient(slip, peak, tyre):
-    b, c, d, e = tyre.stiffness_factor, tyre.shape_factor, tyre.peak_factor, tyre.curvature_factor
+    b, c, d, e = tyre.coefficients
     return peak * d * math.sin(c * math.atan(b * slip - e * (b * slip - math.atan(b * slip))))
 
 

@@ -7,7 +7,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from iwm_power_manager.model import tyre as model
-from iwm_power_manager.model.parameters import Tyre
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from oracles import physics
@@ -15,8 +14,18 @@ from oracles.step import friction_coefficient
 
 PAPER = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params.front.tyre
 TYRES = st.builds(
-    Tyre, st.floats(5.0, 30.0), st.floats(1.2, 2.0), st.floats(0.5, 1.5), st.floats(-2.0, 0.99), st.just(0.5)
+    lambda *values: model.make(
+        "magic_formula", dict(zip(model.MODELS["magic_formula"].ranges, values, strict=True)), 0.5
+    ),
+    st.floats(5.0, 30.0),
+    st.floats(1.2, 2.0),
+    st.floats(0.5, 1.5),
+    st.floats(-2.0, 0.99),
 )
+
+
+def peak_factor(tyre):
+    return model.numbers(tyre)[1]["peak_factor"]
 
 
 @given(st.floats(-10.0, 200.0), st.floats(0.0, 60.0))
@@ -52,7 +61,7 @@ def test_friction_follows_eq_9(slip, peak, tyre):
     expected = friction_coefficient(slip, peak, tyre)
     assert model.friction_coefficient(slip, peak, tyre) == pytest.approx(expected, abs=1e-12)
     assert model.friction_and_slope(slip, peak, tyre)[0] == pytest.approx(expected, abs=1e-12)
-    assert abs(expected) <= peak * tyre.peak_factor
+    assert abs(expected) <= peak * peak_factor(tyre)
 
 
 @given(st.floats(-1.0, 1.0), TYRES)
@@ -64,7 +73,7 @@ def test_the_slope_is_the_derivative(slip, tyre):
 
 def test_the_slope_at_rest_is_b_c_d():
     slope = model.friction_and_slope(0.0, 0.5, PAPER)[1]
-    assert slope == pytest.approx(0.5 * PAPER.peak_factor * PAPER.stiffness_factor * PAPER.shape_factor)
+    assert slope == pytest.approx(0.5 * 10.0 * 1.9 * 1.0)
 
 
 @given(st.floats(-1.5, 1.5), st.floats(0.05, 1.2), TYRES)
@@ -72,7 +81,7 @@ def test_the_inverse_is_the_slip_below_the_peak_or_the_peak(friction, peak, tyre
     # Where the shape never comes down again there is no peak to speak of.
     assume(physics.peak_slip(tyre) < 0.99)
     slip = model.slip_at_friction(friction, peak, tyre)
-    reachable = peak * tyre.peak_factor
+    reachable = peak * peak_factor(tyre)
     assert abs(slip) <= physics.peak_slip(tyre) + 1e-6
     assert friction_coefficient(slip, peak, tyre) == pytest.approx(min(max(friction, -reachable), reachable), abs=1e-9)
 
@@ -85,5 +94,7 @@ def test_without_grip_or_without_demand_there_is_no_slip():
 def test_the_paper_s_tyre_peaks_at_a_slip_of_0_18():
     assert model.peak_slip(PAPER) == pytest.approx(0.18, abs=0.005)
     assert model.peak_slip(PAPER) == pytest.approx(physics.peak_slip(PAPER), abs=1e-6)
-    assert model.peak_slip(PAPER._replace(peak_factor=0.7)) == pytest.approx(physics.peak_slip(PAPER), abs=1e-6)
+    weak = model.make("magic_formula", model.numbers(PAPER)[1] | {"peak_factor": 0.7}, 0.5)
+    assert model.peak_slip(weak) == pytest.approx(physics.peak_slip(PAPER), abs=1e-6)
+    assert model.peak_ratio(weak) == 0.7
     assert model.friction_coefficient(model.peak_slip(PAPER), 0.9, PAPER) == pytest.approx(0.9)
