@@ -1,0 +1,239 @@
+"""Message types by their definitions: what stands in a bag wins, then what is installed, then ROS 2 Jazzy's own.
+
+A definition from outside is parsed and compiled by rosbags. Before that it is measured here, because rosbags unrolls
+nested types and fixed arrays into code (`rosbags.serde.cdr`): a text of a kilobyte can ask for a program of gigabytes.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from functools import lru_cache
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from iwm_power_manager.errors import BagError
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+MSG, IDL = "ros2msg", "ros2idl"
+
+#: Largest definition that is read, its deepest nesting, and the numbers and texts it may unroll to.
+MAX_TEXT_BYTES = 256 * 1024
+MAX_DEPTH = 32
+MAX_FIELDS = 20_000
+
+_SEPARATOR = "=" * 80
+#: How a text of wide characters may lie in CDR: DDS vendors and versions differ in the width and in what they count.
+_WIDE = ("uint16", "uint32", "uint8")
+
+
+class Types(NamedTuple):
+    """A type with all it depends on.
+
+    Attributes
+    ----------
+    store : rosbags type store that holds these types and no others
+    name : the type's name there, such as `std_msgs/msg/Float64`
+    """
+
+    store: Typestore
+    name: str
+
+    def deserialize(self, data: bytes) -> Any:
+        """Message from its CDR bytes; raises whatever a generated decoder makes of bytes that are no message."""
+        return self.store.deserialize_cdr(data, self.name)
+
+    def fits(self, data: bytes) -> bool:
+        """Whether these bytes are a message of this type."""
+        try:
+            self.deserialize(data)
+        except Exception:  # noqa: BLE001 - see `deserialize`
+            return False
+        return True
+
+
+def types_of(msgtype: str, encoding: str = "", text: str = "", sample: bytes = b"") -> Types:
+    """A type and those it is made of.
+
+    Parameters
+    ----------
+    msgtype : name, `pkg/msg/Type` or `pkg/Type`
+    encoding : of `text`: "ros2msg", "ros2idl"; a text in any other is not read
+    text : definition with all it depends on; "" for the installed one
+    sample : a message of this type: decides how wide characters are stored, in a type that has any
+
+    Raises
+    ------
+    BagError
+        No definition is found, or it cannot be read, or is too large.
+    """
+    found = _types_of(msgtype, encoding, text, _WIDE[0])
+    if not sample or "wstring" not in text:
+        return found
+    candidates = (_types_of(msgtype, encoding, text, width) for width in _WIDE)
+    return next((candidate for candidate in candidates if candidate.fits(sample)), found)
+
+
+def definition_of(msgtype: str) -> tuple[str, str]:
+    """Definition (`ros2msg` text with all dependencies) and RIHS01 hash of an installed type.
+
+    Raises
+    ------
+    BagError
+        The type is neither among Jazzy's own nor installed where AMENT_PREFIX_PATH or this Python can find it.
+    """
+    store, name = types_of(msgtype)
+    text, _ = store.generate_msgdef(name, ros_version=2)
+    return text, store.hash_rihs01(name)
+
+
+@lru_cache(maxsize=512)
+def _types_of(msgtype: str, encoding: str, text: str, wide: str) -> Types:
+    from rosbags.typesys.store import Typestore
+
+    try:
+        name = _normalised(msgtype)
+        known: dict[str, Any] = _parsed(name, encoding, text) if text and encoding in (MSG, IDL) else {}
+        given = _needed(name, known, wide)
+        _measure(name, given)
+        store = Typestore()
+        jazzy = _jazzy()
+        for part, definition in given.items():
+            if part not in known:
+                store.fielddefs[part], store.types[part] = definition, jazzy.types[part]
+        store.register({part: definition for part, definition in given.items() if part in known})
+        store.get_msgdef(name)
+    except BagError as error:
+        raise BagError(f"type {msgtype}: {error}") from None
+    except Exception as error:  # noqa: BLE001 - parser and code generator raise anything at a text that is none
+        raise BagError(f"type {msgtype}: its definition cannot be read: {_first_line(error)}") from None
+    return Types(store, name)
+
+
+@lru_cache(maxsize=1)
+def _jazzy() -> Typestore:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def _normalised(msgtype: str) -> str:
+    package, _, rest = msgtype.partition("/")
+    kind, _, name = rest.rpartition("/")
+    full = f"{package}/{kind or 'msg'}/{name}"
+    if not re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*){2,3}", full, re.ASCII):
+        raise BagError("is no name of a message type; allowed: package/msg/Type")
+    return full
+
+
+def _parsed(name: str, encoding: str, text: str) -> dict[str, Any]:
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    if len(text) > MAX_TEXT_BYTES:
+        raise BagError(f"its definition has {len(text)} characters; allowed: <= {MAX_TEXT_BYTES}")
+    text = re.sub(r"^={40,}[ \t]*$", _SEPARATOR, text.replace("\r\n", "\n").replace("\r", "\n"), flags=re.MULTILINE)
+    if encoding == MSG:
+        # The grammar knows no bounded wstring; the bound is not in the bytes.
+        return dict(get_types_from_msg(re.sub(r"^(\s*wstring)<=\d+", r"\1", text, flags=re.MULTILINE), name))
+    parts = [part.split("\n", 1)[1] for part in text.split(_SEPARATOR + "\n")[1:]] if _SEPARATOR in text else [text]
+    return dict(chain.from_iterable(get_types_from_idl(part).items() for part in parts))
+
+
+def _needed(name: str, known: dict[str, Any], wide: str) -> dict[str, Any]:
+    """The definitions a type is made of; those that were not given are added to `known` or come from Jazzy."""
+    needed: dict[str, Any] = {}
+    waiting = [name]
+    while waiting:
+        part = waiting.pop()
+        if part in needed:
+            continue
+        if part not in known and part not in _jazzy().fielddefs:
+            known.update(_installed(part, name))
+        if part in known:
+            constants, fields = known[part]
+            known[part] = constants, [(field, _without_wstring(description, wide)) for field, description in fields]
+            needed[part] = known[part]
+        else:
+            needed[part] = _jazzy().fielddefs[part]
+        waiting += [inner for _, description in needed[part][1] if (inner := _named(description))]
+        if len(needed) > MAX_FIELDS:
+            raise BagError(f"needs more than {MAX_FIELDS} other types")
+    return needed
+
+
+def _installed(part: str, whole: str) -> dict[str, Any]:
+    package, _, rest = part.partition("/")
+    file = f"{rest.rpartition('/')[2]}.msg"
+    prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
+    for prefix in prefixes:
+        path = Path(prefix) / "share" / package / "msg" / file
+        if path.is_file():
+            return _parsed(part, MSG, path.read_text(encoding="utf-8"))
+    if part == whole:
+        raise BagError("no definition found; install its package or source its workspace")
+    raise BagError(f"its definition names {part}, which is not defined in it and not installed")
+
+
+def _named(description: Any) -> str:
+    """Name of the message type inside a rosbags field description, a nested tuple (kind, argument); "" for none."""
+    from rosbags.interfaces import Nodetype
+
+    kind, argument = description
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        kind, argument = argument[0]
+    return str(argument) if kind == Nodetype.NAME else ""
+
+
+def _without_wstring(description: Any, wide: str) -> Any:
+    """A wide text as a sequence of its units: rosbags has no decoder for one (`TIDMAP` in `rosbags.typesys.store`)."""
+    from rosbags.interfaces import Nodetype
+
+    def is_wide(kind: Any, argument: Any) -> bool:
+        name = argument[0] if kind == Nodetype.BASE else argument
+        return bool(kind in (Nodetype.BASE, Nodetype.NAME) and str(name).rpartition("/")[2] == "wstring")
+
+    kind, argument = description
+    if is_wide(kind, argument):
+        return (Nodetype.SEQUENCE, ((Nodetype.BASE, (wide, 0)), 0))
+    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and is_wide(*argument[0]):
+        raise BagError("arrays of wstring cannot be read")
+    return description
+
+
+def _measure(name: str, types: dict[str, Any]) -> None:
+    """Refuse a type that contains itself, nests too deep, or unrolls to more fields than can be compiled."""
+    from rosbags.interfaces import Nodetype
+
+    sizes: dict[str, int] = {}
+
+    def size(part: str, depth: int) -> int:
+        if depth > MAX_DEPTH:
+            raise BagError(f"is nested more than {MAX_DEPTH} deep, or contains itself")
+        if part not in sizes:
+            total = 0
+            for _, description in types[part][1]:
+                kind, argument = description
+                inner = _named(description)
+                one = size(inner, depth + 1) if inner else 1
+                if kind == Nodetype.ARRAY:
+                    (item, base), length = argument
+                    if length < 1:
+                        raise BagError(f"has an array of {length} elements")
+                    one *= length if inner or (item == Nodetype.BASE and base[0] == "string") else 1
+                total += one
+            if total > MAX_FIELDS:
+                raise BagError(f"has more than {MAX_FIELDS} fields with all it contains")
+            sizes[part] = total
+        return sizes[part]
+
+    size(name, 0)
+
+
+def _first_line(error: Exception) -> str:
+    """What a parser says, without the whole text that rosbags puts into its message."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return f"{type(error).__name__} at {lines[-1][:80]!r}" if lines else type(error).__name__

@@ -1,0 +1,110 @@
+"""Message types by their definitions: the bag's own wins, whatever it is written in, and none can run or hang."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from iwm_power_manager.errors import BagError
+from iwm_power_manager.signals.types import MAX_DEPTH, MAX_FIELDS, definition_of, types_of
+
+LINE = "=" * 80
+HEADER = b"\0\1\0\0"
+IDL = f"{LINE}\nIDL: my_msgs/msg/Speed\n\nmodule my_msgs {{ module msg {{ struct Speed {{ double value; }}; }}; }};\n"
+TWIST = f"geometry_msgs/Twist twist\n{LINE}\nMSG: geometry_msgs/Twist\nfloat64 x\n"
+
+
+@pytest.mark.parametrize(
+    ("msgtype", "encoding", "text"),
+    [
+        ("my_msgs/msg/Speed", "ros2msg", "float64 value\n"),
+        ("my_msgs/Speed", "ros2msg", "float64 value\n"),
+        ("my_msgs/msg/Speed", "ros2msg", "# a comment\r\nfloat64 value\r\n"),
+        ("my_msgs/msg/Speed", "ros2idl", IDL),
+    ],
+)
+def test_a_definition_is_read_whatever_it_is_written_in(msgtype: str, encoding: str, text: str) -> None:
+    types = types_of(msgtype, encoding, text)
+    assert types.name == "my_msgs/msg/Speed"
+    assert types.deserialize(HEADER + struct.pack("<d", 9.5)).value == 9.5
+
+
+def test_the_definition_in_the_bag_wins_over_the_standard_one_and_changes_no_other() -> None:
+    forked = types_of("geometry_msgs/msg/TwistStamped", "ros2msg", TWIST)
+    assert forked.deserialize(HEADER + struct.pack("<d", 9.5)).twist.x == 9.5
+    assert [
+        name for name, _ in types_of("geometry_msgs/msg/TwistStamped").store.fielddefs["geometry_msgs/msg/Twist"][1]
+    ] == [
+        "linear",
+        "angular",
+    ]
+
+
+def test_a_type_that_changed_between_two_drives_is_read_as_each_drive_has_it() -> None:
+    old, new = (types_of("my_msgs/msg/S", "ros2msg", text) for text in ("float32 value\n", "int32 n\nfloat64 value\n"))
+    assert old.deserialize(HEADER + struct.pack("<f", 1.5)).value == 1.5
+    assert new.deserialize(HEADER + struct.pack("<i4xd", 1, 2.5)).value == 2.5
+
+
+@pytest.mark.parametrize("unit", ["H", "I"])
+def test_what_stands_behind_a_wide_text_is_read_however_wide_its_characters_are(unit: str) -> None:
+    body = struct.pack(f"<I5{unit}", 5, *b"speed")
+    data = HEADER + body + bytes(-len(body) % 8) + struct.pack("<d", 9.5)
+    types = types_of("my_msgs/msg/S", "ros2msg", "wstring<=8 text\nfloat64 value\n", data)
+    assert types.deserialize(data).value == 9.5
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("other_msgs/Thing thing\n", "names other_msgs/msg/Thing, which is not defined in it and not installed"),
+        ("A a\n", f"nested more than {MAX_DEPTH} deep"),
+        ("string[1000000000] a\n", f"more than {MAX_FIELDS} fields"),
+        ("float64[0] a\n", "an array of 0 elements"),
+        ("wstring[2] a\n", "arrays of wstring"),
+        ("float64 a\nfloat64 a\n", "cannot be read"),
+        ("float64 a" + " " * 300_000 + "\n", "characters; allowed"),
+        ("int32 A=" + "9" * 5000 + "\n", "cannot be read"),
+        (
+            "m/B b\nm/B c\n"
+            + "".join(f"{LINE}\nMSG: m/{chr(66 + i)}\nm/{chr(67 + i)} a\nm/{chr(67 + i)} b\n" for i in range(22))
+            + f"{LINE}\nMSG: m/X\nint8 a\n",
+            f"more than {MAX_FIELDS} fields",
+        ),
+    ],
+)
+def test_what_cannot_be_read_is_refused_in_one_line_with_the_type(text: str, says: str) -> None:
+    with pytest.raises(BagError, match=says) as caught:
+        types_of("m/msg/A", "ros2msg", text)
+    assert str(caught.value).startswith("type m/msg/A: ")
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("name", ["", "A", "../etc/passwd", "a/msg/B\nimport os", "a/b/c/d/e", "a/msg/", "1/2/3"])
+def test_a_name_that_is_none_is_refused(name: str) -> None:
+    with pytest.raises(BagError, match="is no name of a message type"):
+        types_of(name, "ros2msg", "float64 a\n")
+
+
+@given(st.sampled_from(["ros2msg", "ros2idl", "jsonschema"]), st.text(max_size=200))
+@example("ros2msg", "float64 a 1e999")
+@example("ros2msg", 'string A="""\\"; import os')
+def test_no_text_whatever_ends_in_anything_but_types_or_one_line(encoding: str, text: str) -> None:
+    said = ""
+    try:
+        types_of("m/msg/A", encoding, text)
+    except BagError as error:
+        said = str(error)
+    assert "\n" not in said
+
+
+def test_a_definition_comes_with_what_it_depends_on() -> None:
+    text, digest = definition_of("geometry_msgs/msg/TwistStamped")
+    assert "MSG: builtin_interfaces/Time" in text
+    assert digest.startswith("RIHS01_")
+    again = types_of("geometry_msgs/msg/TwistStamped", "ros2msg", text)
+    assert again.store.hash_rihs01(again.name) == digest
