@@ -9,8 +9,9 @@ from __future__ import annotations
 import argparse
 import sys
 
+from iwm_power_manager.control.settings import default_settings
+from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import STRATEGIES, default_settings
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.share import resolve, share_path

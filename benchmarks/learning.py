@@ -22,8 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.demand import chain_of, signal_source, source_of

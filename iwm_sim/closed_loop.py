@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.table import PolicyTable
-from iwm_power_manager.control.types import ControllerState, Measurement, Settings, initial_state
+from iwm_power_manager.control.types import ControllerState, Measurement, initial_state
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.driver import DriverState, Trace, drive, sample

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from iwm_power_manager.control.split import PRICE_OF_MISSING
+from iwm_power_manager.control.strategies.instantaneous import PRICE_OF_MISSING
 from iwm_power_manager.jit import kernel, parallel_kernel
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w

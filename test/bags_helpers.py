@@ -16,9 +16,9 @@ from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.supervision import SupervisionLimits
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.policy import choose, load_policy_bank
 from iwm_power_manager.replay import steps
 from iwm_power_manager.replay.plan import WHEEL_NAMES

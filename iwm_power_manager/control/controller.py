@@ -14,6 +14,7 @@ from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import InputLimits, InputMonitor
 from iwm_power_manager.control.record import Watch, to_numbers
+from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.supervision import (
     LOCKSTEP_SUPERVISION,
     STALE_SPEED,
@@ -25,7 +26,7 @@ from iwm_power_manager.control.supervision import (
     supervise,
 )
 from iwm_power_manager.control.table import PolicyTable
-from iwm_power_manager.control.types import Command, Measurement, Settings, initial_state
+from iwm_power_manager.control.types import Command, Measurement, initial_state
 from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.model.parameters import VehicleParams
 

@@ -19,13 +19,13 @@ from __future__ import annotations
 
 import math
 
+from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, Settings
 from iwm_power_manager.control.slew import approached, slewed
 from iwm_power_manager.control.slip import UNLIMITED_NM, axle_slip, filtered, road_torque_nm, torque_room_nm
 from iwm_power_manager.control.split import decide
+from iwm_power_manager.control.strategy import Situation
 from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import (
-    GATE_MODE_LIMITER,
-    GATE_MODE_OFF,
     LIMIT_BATTERY_CHARGE,
     LIMIT_BATTERY_DISCHARGE,
     LIMIT_FRICTION_BRAKE,
@@ -37,7 +37,6 @@ from iwm_power_manager.control.types import (
     Command,
     ControllerState,
     Measurement,
-    Settings,
 )
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.gate import axle_gated, gated_split
@@ -134,19 +133,17 @@ def step(
     # Half a step of slack: sums of 0.01 s must not delay every tenth decision by a step.
     if first or age >= settings.decision_period_s - 0.5 * dt:
         recent *= math.exp(-age / settings.reversal_s)
-        decided = decide(
-            demand,
-            speed,
-            front_slip,
-            rear_slip,
-            decided,
-            recent,
-            measurement.friction,
-            decisions,
-            settings,
-            vehicle,
-            policy,
+        situation = Situation(
+            power_demand_w=demand,
+            speed_mps=speed,
+            front_slip=front_slip,
+            rear_slip=rear_slip,
+            previous_share=decided,
+            recent_change=recent,
+            friction=measurement.friction,
+            decisions=decisions,
         )
+        decided = decide(situation, settings, vehicle, policy)
         recent += decided - state.decided_share
         decisions += 1
         age = 0.0

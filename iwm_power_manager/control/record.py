@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from iwm_power_manager.control.settings import DEFAULTS, Settings
 from iwm_power_manager.control.supervision import Supervision
-from iwm_power_manager.control.types import Command, ControllerState, Measurement, Settings, default_settings
+from iwm_power_manager.control.types import Command, ControllerState, Measurement
 
 _WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 _SETTING = "setting."
@@ -69,7 +70,7 @@ _SUPERVISION = (
     Signal("power_demand_age_s", "age of the power demand"),
     Signal("battery_state_age_s", "age of the battery's state"),
 )
-_SETTING_TYPES = {name: type(value) for name, value in default_settings()._asdict().items()}
+_SETTING_TYPES = {name: type(value) for name, value in DEFAULTS._asdict().items()}
 _SETTINGS = tuple(Signal(_SETTING + name, "the law's setting of that name") for name in Settings._fields)
 
 #: All signals, in the order in which they are published.

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_power_manager.control.table import PolicyTable, empty_table
-from iwm_power_manager.control.types import SDP, SDP_LOOKAHEAD, STRATEGIES
 from iwm_power_manager.errors import PolicyError
 from iwm_power_manager.policy import Policy, choose, load_policy_bank
 from iwm_power_manager.ros import diagnostics
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle
-
-_NEED_POLICY = (SDP, SDP_LOOKAHEAD)
 
 
 class Policies:
@@ -109,7 +107,7 @@ def choose_policies(path: str, strategy: str, fallback: str, rule: list[float], 
 
 
 def _needs_policy(strategy: str) -> bool:
-    return STRATEGIES[strategy] in _NEED_POLICY
+    return STRATEGIES[strategy].needs_policy
 
 
 def _load(path: str, vehicle: Vehicle) -> tuple[list[Policy], dict[Path, int]]:

@@ -5,34 +5,32 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from iwm_power_manager.control import settings
 from iwm_power_manager.control.inputs import StampLimits, ValueLimits, WheelLimits
 from iwm_power_manager.control.monitor import InputLimits
+from iwm_power_manager.control.settings import Change
 from iwm_power_manager.control.supervision import SupervisionLimits
-from iwm_power_manager.control.types import GATE_MODES, PREVIEW, STRATEGIES, Settings, default_settings
 from iwm_power_manager.ros import messages
-from iwm_power_manager.ros.parameters import Change, Spec, yaml_text
+from iwm_power_manager.ros.parameters import Spec, yaml_text
 
 _INF = float("inf")
-_LAW = default_settings()
-_NAMED_STRATEGIES = tuple(name for name, code in STRATEGIES.items() if code != PREVIEW)  # preview knows the future
 
-#: The law's numeric settings with their ranges; names and defaults come from `control.types`.
-_LAW_RANGES = {
-    "decision_period_s": (0.001, 10.0, "the split is decided this often, s"),
-    "share_rate_per_s": (0.01, 1000.0, "fastest change of the applied front share, 1/s"),
-    "critical_slip": (0.02, 0.9, "slip beyond which an axle is gated (Table 2)"),
-    "gate_hysteresis": (0.0, 0.5, "a gated axle is freed when its slip is this far inside again"),
-    "slip_target": (0.01, 0.9, "slip the limiter holds, below critical_slip"),
-    "slip_limiter_s": (0.001, 1.0, "time constant of the slip limiter, s"),
-    "slip_filter_s": (0.0, 1.0, "low-pass filter of the slip, s; 0 is none"),
-    "slip_speed_floor_mps": (0.01, 10.0, "denominator of slip is at least this, m/s"),
-    "slew_up_nmps": (10.0, 1e6, "fastest growth of a driving motor torque, N m/s"),
-    "slew_down_nmps": (100.0, 1e6, "fastest way of a motor torque to zero, N m/s"),
-    "slew_regeneration_nmps": (10.0, 1e6, "fastest growth of a regenerative torque, N m/s; friction fills in"),
-    "switching_power_w": (0.0, 1e5, "instantaneous_slip: a change of the share has to save this much, W"),
-    "reversal_price": (0.0, 1000.0, "sdp_lookahead: how much dearer it is to take a change of the share back at once"),
-    "reversal_s": (0.01, 60.0, "time constant with which reversal_price is forgotten, s"),
-}
+
+def _law_specs() -> list[Spec]:
+    """A parameter for each setting of the control law."""
+    return [
+        Spec(
+            name,
+            settings.shown(name, getattr(settings.DEFAULTS, name)),
+            f"Control law: {known.described()}.",
+            known.low,
+            known.high,
+            choices=tuple(known.choices),
+            change=known.change,
+        )
+        for name, known in settings.TABLE.items()
+    ]
+
 
 SPECS = (
     Spec(
@@ -42,13 +40,6 @@ SPECS = (
         "idle_drive", "", "Overrides the vehicle's idle_drive; empty keeps it.", choices=("", "none", "drag", "enabled")
     ),
     Spec("policy_file", "policies", "Policy file, or folder with a bank of policies over friction; '' for none."),
-    Spec(
-        "strategy",
-        "sdp_lookahead",
-        "Strategy that splits the demand between the axles.",
-        choices=_NAMED_STRATEGIES,
-        change=Change.ALWAYS,
-    ),
     Spec(
         "rule",
         [0.0, 0.5, 0.0, 0.5],
@@ -78,19 +69,7 @@ SPECS = (
         "Names of the wheels in JointState messages, in the order front left, front right, rear left, rear right.",
         length=4,
     ),
-    Spec(
-        "gate_mode",
-        "limiter",
-        "Skid avoidance: off, table2 (on/off gate of the paper), limiter (holds the wheel "
-        "short of the critical slip, the gate is the last resort).",
-        choices=tuple(GATE_MODES),
-        change=Change.ALWAYS,
-    ),
-    Spec("gate_driving", _LAW.gate_driving, "Also gate driving slip.", change=Change.ALWAYS),
-    *(
-        Spec(name, getattr(_LAW, name), f"Control law: {meaning}.", low, high, change=Change.ALWAYS)
-        for name, (low, high, meaning) in _LAW_RANGES.items()
-    ),
+    *_law_specs(),
     Spec("friction", 0.9, "Peak friction coefficient the strategy assumes.", 0.05, 1.5, change=Change.ALWAYS),
     Spec(
         "friction_source",
@@ -225,8 +204,7 @@ DEFAULTS: dict[str, Any] = {spec.name: spec.default for spec in SPECS}
 def check_together(values: Mapping[str, Any]) -> str:
     """What is wrong with values that are right one by one; "" if nothing is."""
     for small, large in (
-        ("slip_target", "critical_slip"),
-        ("gate_hysteresis", "critical_slip"),
+        *settings.ORDERED,
         ("execution_warn_us", "execution_error_us"),
         ("periodicity_warn_hz", "periodicity_error_hz"),
     ):
@@ -235,15 +213,9 @@ def check_together(values: Mapping[str, Any]) -> str:
     return ""
 
 
-def law_settings(values: Mapping[str, Any], strategy: str) -> Settings:
+def law_settings(values: Mapping[str, Any], strategy: str) -> settings.Settings:
     """The law's settings."""
-    numbers = {name: values[name] for name in _LAW_RANGES}
-    return Settings(
-        strategy=STRATEGIES[strategy],
-        gate_mode=GATE_MODES[values["gate_mode"]],
-        gate_driving=values["gate_driving"],
-        **numbers,
-    )
+    return settings.Settings(**settings.from_shown({**values, "strategy": strategy}))
 
 
 def age_limits_s(values: Mapping[str, Any]) -> tuple[float, float, float, float]:

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from iwm_power_manager.control import settings as law_settings
+from iwm_power_manager.control.settings import DEFAULTS, Settings
+from iwm_power_manager.control.strategies import STRATEGIES, name_of
 from iwm_power_manager.control.table import PolicyTable, empty_table
-from iwm_power_manager.control.types import (
-    GATE_MODES,
-    PREVIEW,
-    SDP,
-    SDP_LOOKAHEAD,
-    STRATEGIES,
-    Settings,
-    default_settings,
-)
 from iwm_power_manager.errors import ConfigError, PolicyError
-from iwm_power_manager.files import check_number, content_sha256
+from iwm_power_manager.files import content_sha256
 from iwm_power_manager.policy import Policy, choose, load_policy_bank
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
@@ -31,7 +24,6 @@ WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 
 _NODE = "/power_manager"
 _PARAMETERS = "parameters "
-_NEED_POLICY = (SDP, SDP_LOOKAHEAD)
 
 
 class Choice(NamedTuple):
@@ -78,7 +70,7 @@ class PolicyBank:
         PolicyError
             The strategy needs a policy, and there is none that is whole and for this car.
         """
-        if strategy not in _NEED_POLICY:
+        if not STRATEGIES[name_of(strategy)].needs_policy:
             return self._empty
         if friction not in self._tables:
             policy = choose(self._loaded(), friction)
@@ -139,20 +131,23 @@ def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
     recorded = recorded_parameters(custom_data)
     idle_drive = recorded.get("idle_drive") or None if choice.vehicle is None else None
     vehicle = load_vehicle(resolve(choice.vehicle or recorded.get("vehicle_file") or DEFAULT_VEHICLE), idle_drive)
-    changes = dict(_setting(text) for text in choice.settings)
+    changes = {}
+    for text in choice.settings:
+        name, _, value = text.partition("=")
+        changes[name] = law_settings.parse("--set", name, value)
     if choice.strategy is not None:
-        changes["strategy"] = _strategy(choice.strategy)
-    settings = default_settings(str(recorded.get("strategy") or "sdp"))
-    known = {name: recorded[name] for name in Settings._fields if name in recorded and name != "strategy"}
-    if "gate_mode" in known:
-        known["gate_mode"] = GATE_MODES[known["gate_mode"]]
+        changes["strategy"] = law_settings.parse("--strategy", "strategy", choice.strategy)
+    settings = DEFAULTS._replace(**law_settings.from_shown(recorded))._replace(**changes)
+    problem = law_settings.check_together(settings._asdict()) if changes else ""
+    if problem:
+        raise ConfigError("--set", *problem.split(": ", 1))
     wheel_names = tuple(recorded.get("wheel_names") or WHEEL_NAMES)
     policy = choice.policy if choice.policy is not None else recorded.get("policy_file", DEFAULT_POLICY)
     return Plan(
         vehicle,
         PolicyBank(str(policy), recorded.get("rule") or (), vehicle),
         changes,
-        settings._replace(**known)._replace(**changes),
+        settings,
         choice.friction if choice.friction is not None else float(recorded.get("friction", DEFAULT_FRICTION)),
         choice.friction is None,
         wheel_names,
@@ -171,32 +166,3 @@ def recorded_parameters(custom_data: Mapping[str, str]) -> dict[str, Any]:
             if isinstance(found, dict):
                 return found
     return {}
-
-
-def _strategy(name: str) -> int:
-    code = STRATEGIES.get(name)
-    if code is None or code == PREVIEW:
-        allowed = " | ".join(key for key, value in STRATEGIES.items() if value != PREVIEW)
-        raise ConfigError("--strategy", "", f"{name!r} cannot be replayed", allowed)
-    return code
-
-
-def _setting(text: str) -> tuple[str, Any]:
-    name, _, value = text.partition("=")
-    defaults = default_settings()._asdict()
-    del defaults["strategy"]
-    if name not in defaults:
-        raise ConfigError("--set", name, "is no setting of the law", ", ".join(defaults))
-    if name == "gate_mode":
-        if value not in GATE_MODES:
-            raise ConfigError("--set", name, f"{value!r} is unknown", " | ".join(GATE_MODES))
-        return name, GATE_MODES[value]
-    if isinstance(defaults[name], bool):
-        if value not in ("true", "false"):
-            raise ConfigError("--set", name, f"{value!r} is neither true nor false", "true | false")
-        return name, value == "true"
-    try:
-        number = float(value)
-    except ValueError:
-        number = math.nan
-    return name, check_number("--set", name, number, 0.0)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.control.record import SIGNAL_NAMES, from_numbers
-from iwm_power_manager.control.types import STRATEGIES, Measurement, Wheels
+from iwm_power_manager.control.types import Measurement, Wheels
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm
 from iwm_power_manager.model.parameters import VehicleParams
@@ -118,11 +118,6 @@ def what_if(
                 meter.add(measurement, step.command.motor_torque_nm, step.command.friction_torque_nm)
         results.append(meter.result())
     return results
-
-
-def strategy_name(code: int) -> str:
-    """Name of a strategy's code."""
-    return next(name for name, value in STRATEGIES.items() if value == code)
 
 
 def _wheels(values: dict[str, float], kind: str) -> Wheels:

@@ -8,7 +8,6 @@ also what `docs/interface.md` is tested against.
 from __future__ import annotations
 
 import difflib
-import enum
 import json
 import math
 import textwrap
@@ -24,6 +23,7 @@ from rclpy.exceptions import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from iwm_power_manager.control.settings import Change as Change  # part of this interface
 from iwm_power_manager.errors import IwmError
 
 Value = bool | int | float | str | list[str] | list[float]
@@ -32,14 +32,6 @@ Value = bool | int | float | str | list[str] | list[float]
 _WIDTH = 118
 #: Parameters that rclpy declares itself, some of them later.
 _ROS_PREFIXES = ("qos_overrides.", "start_type_description_service", "use_sim_time")
-
-
-class Change(enum.Enum):
-    """When a parameter may change."""
-
-    NEVER = "at start only"
-    UNCONFIGURED = "while unconfigured"
-    ALWAYS = "at any time"
 
 
 class ParameterError(IwmError):

@@ -21,12 +21,12 @@ from tqdm import tqdm
 from iwm_power_manager import __version__
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
-from iwm_power_manager.control.types import STRATEGIES
+from iwm_power_manager.control.strategies import drivable, name_of
 from iwm_power_manager.errors import BagError, ConfigError, IwmError
 from iwm_power_manager.files import atomic_write, check_number
 from iwm_power_manager.replay.plan import Choice, Plan, make_plan
 from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds
-from iwm_power_manager.replay.what_if import Consumption, strategy_name, what_if
+from iwm_power_manager.replay.what_if import Consumption, what_if
 from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.mapping import SignalMapping, load_mapping
 
@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    strategies = ", ".join(name for name in STRATEGIES if name != "preview")
+    strategies = ", ".join(drivable())
     parser.add_argument("bag", metavar="BAG", help="folder of the bag, or one .mcap or .db3 file")
     parser.add_argument("--version", action="version", version=f"replay {__version__}")
     law = parser.add_argument_group("the law; what is not given comes from the bag, else from the package")
@@ -166,7 +166,7 @@ def _replay(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace)
 
 
 def _what_if(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace) -> int:
-    names = options.strategy or ["equal", strategy_name(_plan(bag, options, options.what_if, None).settings.strategy)]
+    names = options.strategy or ["equal", name_of(_plan(bag, options, options.what_if, None).settings.strategy)]
     plans = [(name, _plan(bag, options, options.what_if, name)) for name in dict.fromkeys(names)]
     with _progress(bag, options, len(plans)) as progress:
         rows = what_if(bag, plans, mapping, progress)
@@ -213,7 +213,7 @@ def _custom_data(bag: BagReader, plan: Plan) -> dict[str, str]:
         "package_version": __version__,
         "replay_of": bag.path.name,
         "replay_vehicle_hash": plan.vehicle.hash,
-        "replay_strategy": strategy_name(plan.settings.strategy),
+        "replay_strategy": name_of(plan.settings.strategy),
         "replay_changes": json.dumps(plan.changes, sort_keys=True),
     }
 

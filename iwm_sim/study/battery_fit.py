@@ -24,8 +24,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize, minimize_scalar
 
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import Battery

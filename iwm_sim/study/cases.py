@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from iwm_power_manager.control.settings import Settings, default_settings
+from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_power_manager.control.table import PolicyTable, empty_table
-from iwm_power_manager.control.types import SDP, SDP_LOOKAHEAD, STRATEGIES, Settings, default_settings
 from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
@@ -33,7 +34,7 @@ from iwm_sim.metrics import Metrics, measure
 FloatArray = npt.NDArray[np.float64]
 
 #: Strategies that need a solved policy.
-POLICY_STRATEGIES = frozenset(name for name, code in STRATEGIES.items() if code in (SDP, SDP_LOOKAHEAD))
+POLICY_STRATEGIES = frozenset(name for name, known in STRATEGIES.items() if known.needs_policy)
 
 #: Every saving is against this one.
 REFERENCE = "equal"
@@ -175,7 +176,7 @@ def drive(case: Case, until_s: float = np.inf) -> Run:
     """
     cycle = cycle_of(case.cycle)
     vehicle = vehicle_of(case.vehicle, case.idle_drive, case.car)
-    settings = case.settings._replace(strategy=STRATEGIES[case.strategy])
+    settings = case.settings._replace(strategy=STRATEGIES[case.strategy].code)
     return closed_loop.run(
         cycle,
         vehicle,
@@ -215,7 +216,7 @@ def known_in_advance(case: Case, vehicle: Vehicle, until_s: float = np.inf) -> t
     equal = closed_loop.run(
         cycle_of(case.cycle),
         vehicle,
-        case.settings._replace(strategy=STRATEGIES[REFERENCE]),
+        case.settings._replace(strategy=STRATEGIES[REFERENCE].code),
         empty_table(),
         case.friction,
         assumed_friction=case.assumed_friction,
@@ -366,7 +367,7 @@ def _row(made: Result, reference: Metrics | None, bound: Metrics | None) -> dict
         "initial_soc": case.soc,
         "noise": case.noise._asdict(),
         "plant_changes": {f"{c.section}.{c.name}": c.value for c in case.plant},
-        "settings": case.settings._replace(strategy=STRATEGIES[case.strategy])._asdict(),
+        "settings": case.settings._replace(strategy=STRATEGIES[case.strategy].code)._asdict(),
         "rule": list(case.rule) or None,
         "preview_switching_cost_j": (
             [case.switching_cost_j, case.switching_fixed_cost_j] if case.strategy == "preview" else None

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from iwm_power_manager import __version__
-from iwm_power_manager.control.types import GATE_MODES, default_settings
+from iwm_power_manager.control.settings import GATE_MODES, default_settings
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT

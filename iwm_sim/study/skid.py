@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.settings import GATE_MODES, default_settings
+from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import GATE_MODES, STRATEGIES, default_settings, initial_state
+from iwm_power_manager.control.types import initial_state
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.tyre import friction_coefficient, slip_ratio
@@ -97,7 +99,7 @@ def emergency_stop(stop: Stop) -> dict[str, Any]:
         "friction": stop.friction,
         "gate_mode": stop.gate_mode,
         "strategy": stop.strategy,
-        "strategy_code": STRATEGIES[stop.strategy],
+        "strategy_code": STRATEGIES[stop.strategy].code,
         "distance_m": float(car.distance_m),
         "best_m": best_m,
         "best_slip": -best_slip,

@@ -25,8 +25,9 @@ import numpy as np
 from tqdm import tqdm
 
 from iwm_power_manager import files, jit
+from iwm_power_manager.control.settings import Settings
+from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES, drivable
 from iwm_power_manager.control.table import PolicyTable, empty_table
-from iwm_power_manager.control.types import PREVIEW, STRATEGIES, Settings
 from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
@@ -109,12 +110,11 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
         description="Drive a cycle over DDS with recorder, power manager and simulator, and show the result.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    names = [name for name, code in STRATEGIES.items() if code != PREVIEW]
     parser.add_argument("--cycle", default="config/cycles/nycc.csv", help="drive cycle, CSV")
     parser.add_argument("--vehicle", default="config/vehicles/jalalmaab_2015.yaml", help="vehicle, YAML")
     parser.add_argument("--policy", default="policies", help="policy file, or folder with a bank of them")
     parser.add_argument(
-        "--strategy", default="sdp_lookahead", choices=names, help="how the power manager splits the demand"
+        "--strategy", default=DEFAULT_STRATEGY, choices=drivable(), help="how the power manager splits the demand"
     )
     parser.add_argument("--friction", default=0.9, type=_number(0.05, 1.5), help="peak friction coefficient")
     parser.add_argument(
@@ -238,7 +238,7 @@ def power_manager_parameters() -> dict[str, Any]:
 def closed_loop_run(plan: Plan, loaded: Loaded, *, equal: bool = False) -> Run:
     """The same drive in this process, or the reference."""
     period_s = round(1e9 / plan.rate_hz) / 1e9
-    settings = loaded.settings._replace(strategy=STRATEGIES[_REFERENCE]) if equal else loaded.settings
+    settings = loaded.settings._replace(strategy=STRATEGIES[_REFERENCE].code) if equal else loaded.settings
     policy = empty_table() if equal else loaded.policy
     return closed_loop.run(
         loaded.cycle,

@@ -18,7 +18,8 @@ from typing import Any
 from tqdm import tqdm
 
 from iwm_power_manager import __version__
-from iwm_power_manager.control.types import GATE_MODES, STRATEGIES, Settings, default_settings
+from iwm_power_manager.control import settings as law_settings
+from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import IDLE_DRIVES
@@ -90,9 +91,9 @@ def parser() -> argparse.ArgumentParser:
         "--strategy",
         nargs="+",
         choices=list(STRATEGIES),
-        default=["equal", "sdp"],
+        default=[DEFAULT_STRATEGY],
         metavar="NAME",
-        help=f"{', '.join(STRATEGIES)} (default: equal sdp)",
+        help=f"{', '.join(STRATEGIES)} (default: {DEFAULT_STRATEGY}); equal is always driven beside",
     )
     what.add_argument(
         "--idle-drive",
@@ -121,30 +122,8 @@ def parser() -> argparse.ArgumentParser:
     policy.add_argument("--no-solve", action="store_true", help="a missing policy is an error")
 
     law = result.add_argument_group("control law")
-    default = default_settings()
-    law.add_argument(
-        "--gate-mode", choices=list(GATE_MODES), default="limiter", help="skid avoidance (default: limiter)"
-    )
-    law.add_argument(
-        "--gate-driving",
-        action=argparse.BooleanOptionalAction,
-        default=default.gate_driving,
-        help="gate driving slip as well as braking slip",
-    )
-    law.add_argument(
-        "--critical-slip",
-        type=_number(0.02, 0.9),
-        default=default.critical_slip,
-        metavar="SLIP",
-        help="slip beyond which an axle is gated (default: %(default)s)",
-    )
-    law.add_argument(
-        "--switching-power",
-        type=_number(0.0, 1e5),
-        default=default.switching_power_w,
-        metavar="W",
-        help="instantaneous_slip: a change of the share has to save this much (default: %(default)g)",
-    )
+    for name in ("gate_mode", "gate_driving", "critical_slip", "switching_power_w"):
+        _add_setting(law, name)
     law.add_argument(
         "--switching-cost",
         type=_number(0.0, 1e6),
@@ -233,6 +212,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("evaluate: interrupted; nothing half-written is left", file=sys.stderr)
         return INTERRUPTED
     return DONE
+
+
+def _add_setting(group: argparse._ArgumentGroup, name: str) -> None:
+    """An option for a setting of the law, made from the law's own table."""
+    known, default = law_settings.TABLE[name], getattr(law_settings.DEFAULTS, name)
+    option = "--" + name.removesuffix("_w").replace("_", "-")
+    help_text = f"{known.described()} (default: {law_settings.shown(name, default)})"
+    if isinstance(default, bool):
+        group.add_argument(option, action=argparse.BooleanOptionalAction, default=default, help=known.meaning)
+        return
+
+    def value(text: str) -> Any:
+        try:
+            return law_settings.parse(option, name, text)
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(f"{error.problem}; allowed: {error.allowed}") from None
+
+    metavar = "NAME" if known.choices else known.unit.upper() or "X"
+    group.add_argument(option, dest=name, type=value, default=default, metavar=metavar, help=help_text)
 
 
 def _number(low: float, high: float) -> Callable[[str], float]:
@@ -341,18 +339,19 @@ def _with_policy(case: Case, policy: str, switching_cost_j: float | None) -> Cas
     )
 
 
-def _settings(options: argparse.Namespace) -> Settings:
-    settings = default_settings()._replace(
-        gate_mode=GATE_MODES[options.gate_mode],
-        gate_driving=options.gate_driving,
-        critical_slip=options.critical_slip,
-        switching_power_w=options.switching_power,
-    )
-    if options.gate_mode == "table2":
+def _settings(options: argparse.Namespace) -> law_settings.Settings:
+    given = {name: value for name, value in vars(options).items() if name in law_settings.TABLE and name != "strategy"}
+    settings = law_settings.DEFAULTS._replace(**given)
+    if settings.gate_mode == law_settings.GATE_MODE_TABLE2:
         settings = settings._replace(gate_hysteresis=0.0)  # as printed
     target = min(settings.slip_target, 0.75 * settings.critical_slip)  # the limiter works in front of the gate
-    period = settings.decision_period_s
-    return settings._replace(slip_target=target, decision_period_s=max(period, options.dt))
+    settings = settings._replace(
+        slip_target=target, decision_period_s=max(settings.decision_period_s, options.dt)
+    )
+    problem = law_settings.check_together(settings._asdict())
+    if problem:
+        raise ConfigError("arguments", *problem.split(": ", 1))
+    return settings
 
 
 class _Saving:

@@ -30,8 +30,8 @@ import numpy as np
 from tqdm import tqdm
 
 from iwm_power_manager import __version__
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import PolicyTable, empty_table
-from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import Cycle, load_cycle, make_cycle
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.files import atomic_write, check_number

@@ -17,6 +17,7 @@ from iwm_power_manager.control import law
 from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES, SIGNALS, from_numbers
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.supervision import (
     MODE_DEGRADED,
     MODE_NORMAL,
@@ -29,7 +30,7 @@ from iwm_power_manager.control.supervision import (
     SupervisionLimits,
 )
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import GATE_BOTH, GATE_FRONT, GATE_REAR, default_settings, initial_state
+from iwm_power_manager.control.types import GATE_BOTH, GATE_FRONT, GATE_REAR, initial_state
 from iwm_power_manager.model.limits import car_power_w
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.share import resolve
@@ -256,14 +257,14 @@ class TestLostWheel:
         values = drive.run(2, wheels=(math.nan, 30.0, 30.5, 30.5))
         assert values["wheels_lost"] == 1
         assert values["front_left_speed_radps"] == 30.0
-        assert values["setting.critical_slip"] == default_settings().critical_slip / 2
-        assert values["setting.slip_target"] == default_settings().slip_target / 2
-        assert values["setting.gate_hysteresis"] == default_settings().gate_hysteresis / 2
+        assert values["setting.critical_slip"] == default_settings("equal").critical_slip / 2
+        assert values["setting.slip_target"] == default_settings("equal").slip_target / 2
+        assert values["setting.gate_hysteresis"] == default_settings("equal").gate_hysteresis / 2
         assert values["mode"] == MODE_NORMAL
         assert min(motor(values)) > 0.0
         values = drive.run(100)
         assert values["wheels_lost"] == 0
-        assert values["setting.critical_slip"] == default_settings().critical_slip
+        assert values["setting.critical_slip"] == default_settings("equal").critical_slip
 
     def test_each_wheel_has_its_bit(self, drive) -> None:
         drive.run(60)
@@ -321,8 +322,8 @@ class TestRecord:
 
     def test_settings_come_back_with_the_types_the_law_was_compiled_for(self, drive) -> None:
         settings_again = from_numbers(drive.run(1)).settings
-        assert settings_again == default_settings()
-        assert [type(a) for a in settings_again] == [type(b) for b in default_settings()]
+        assert settings_again == default_settings("equal")
+        assert [type(a) for a in settings_again] == [type(b) for b in default_settings("equal")]
 
     def test_a_record_that_lacks_a_signal_is_refused(self, drive) -> None:
         values = drive.run(1)

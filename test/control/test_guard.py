@@ -19,7 +19,7 @@ PEAK, BRAKE = 200.0, 900.0
 @pytest.fixture(scope="module")
 def vehicle() -> VehicleParams:
     params = load_vehicle(resolve(Path("config/vehicles/jalalmaab_2015.yaml"))).params
-    return params._replace(
+    return params.with_axles(
         motor=params.front.motor._replace(peak_torque_nm=PEAK),
         friction_brake=params.front.friction_brake._replace(max_torque_nm=BRAKE),
     )

@@ -11,15 +11,16 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control import law
 from iwm_power_manager.control import types as t
-from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import (
-    Command,
-    ControllerState,
-    Measurement,
+from iwm_power_manager.control.settings import (
+    GATE_MODE_LIMITER,
+    GATE_MODE_OFF,
+    GATE_MODE_TABLE2,
     Settings,
     default_settings,
-    initial_state,
 )
+from iwm_power_manager.control.strategies import STRATEGIES
+from iwm_power_manager.control.table import empty_table
+from iwm_power_manager.control.types import Command, ControllerState, Measurement, initial_state
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -38,8 +39,9 @@ CARS = {
 CAR = CARS["drag"]
 RADIUS = CAR.front.wheel.radius_m
 TABLE = empty_table(rule=(300.0, 0.4, -200.0, 0.7), schedule=(0.5, 0.0, 1.0, 0.3, 0.85, 1.0))
-DEFAULT = default_settings()
+DEFAULT = default_settings("equal")
 NO_LIMIT = 47500.0
+EQUAL, RULE, PREVIEW, SDP_LOOKAHEAD = (STRATEGIES[n].code for n in ("equal", "rule", "preview", "sdp_lookahead"))
 
 #: A power below this is the rounding of torques to zero (1e-6 N m at 200 rad/s, four wheels), W.
 POWER_SLACK_W = 1e-3
@@ -78,7 +80,7 @@ class Case(NamedTuple):
 
     def grip_nm(self, i):
         """What the slip limiter leaves an axle."""
-        if self.settings.gate_mode != t.GATE_MODE_LIMITER:
+        if self.settings.gate_mode != GATE_MODE_LIMITER:
             return math.inf
         wheels = self.axles()[i][0]
         road = (self.after.front_road_nm, self.after.rear_road_nm)[i]
@@ -144,10 +146,10 @@ def measurements(draw, dt=STEPS):
 
 TUNINGS = st.builds(
     lambda **changes: DEFAULT._replace(**changes),
-    strategy=st.sampled_from((t.EQUAL, t.RULE, t.PREVIEW, t.PREVIEW)),
+    strategy=st.sampled_from((EQUAL, RULE, PREVIEW, PREVIEW)),
     decision_period_s=st.sampled_from((0.02, 0.1)),
     share_rate_per_s=st.sampled_from((2.0, 20.0)),
-    gate_mode=st.sampled_from((t.GATE_MODE_OFF, t.GATE_MODE_TABLE2, t.GATE_MODE_LIMITER, t.GATE_MODE_LIMITER)),
+    gate_mode=st.sampled_from((GATE_MODE_OFF, GATE_MODE_TABLE2, GATE_MODE_LIMITER, GATE_MODE_LIMITER)),
     critical_slip=st.sampled_from((0.2, 0.1)),
     gate_hysteresis=st.sampled_from((0.0, 0.05)),
     gate_driving=st.booleans(),
@@ -228,7 +230,7 @@ def a_gated_axle_has_no_torque_at_all(case):
     assert case.command.gate == case.after.front_gated + 2 * case.after.rear_gated
     for _, motor, brake, _, _, gated in case.axles():
         assert not gated or (motor == 0.0 and brake == 0.0)
-    if case.settings.gate_mode == t.GATE_MODE_OFF:
+    if case.settings.gate_mode == GATE_MODE_OFF:
         assert case.command.gate == t.GATE_NONE
 
 
@@ -330,9 +332,9 @@ def the_same_step_gives_the_same_bits(case):
 
 def it_does_what_the_plain_law_does(case):
     def decide(front_slip, rear_slip):
-        if case.settings.strategy == t.EQUAL:
+        if case.settings.strategy == EQUAL:
             return 0.5
-        if case.settings.strategy == t.PREVIEW:
+        if case.settings.strategy == PREVIEW:
             return TABLE.schedule[min(case.before.decisions, len(TABLE.schedule) - 1)]
         small = abs(case.m.power_demand_w) < 1.0
         return case.before.decided_share if small else rule(case.m.power_demand_w, TABLE.rule)
@@ -420,7 +422,7 @@ def test_all_of_it_holds_from_the_first_step_on_for_any_sequence_of_measurements
 
 # --- Table 2 as printed ----------------------------------------------------------------------------------------------
 
-TABLE2 = DEFAULT._replace(gate_mode=t.GATE_MODE_TABLE2, gate_hysteresis=0.0, gate_driving=False)
+TABLE2 = DEFAULT._replace(gate_mode=GATE_MODE_TABLE2, gate_hysteresis=0.0, gate_driving=False)
 
 
 @pytest.mark.parametrize(
@@ -433,7 +435,7 @@ TABLE2 = DEFAULT._replace(gate_mode=t.GATE_MODE_TABLE2, gate_hysteresis=0.0, gat
     ],
 )
 def test_table_2_as_printed(slips, gate, parts):
-    s = TABLE2._replace(strategy=t.RULE)
+    s = TABLE2._replace(strategy=RULE)
     table = TABLE._replace(rule=TABLE.rule * 0.0 + [0.0, 0.3, 0.0, 0.3])
     m = measurement(slips=slips, demand=-4000.0)
     command, _ = law.step(m, initial_state(), s, CAR, table)
@@ -487,7 +489,7 @@ def test_a_gate_cuts_at_once_and_the_way_back_is_slew_limited():
     [(0.01, 0.02, [0, 2, 4, 6, 8]), (0.01, 0.05, [0, 5]), (0.1, 0.02, range(10)), (0.03, 0.107, [0, 4, 8])],
 )
 def test_the_split_is_decided_once_a_period(dt, period, taken):
-    s, state, steps = DEFAULT._replace(strategy=t.PREVIEW, decision_period_s=period), initial_state(), []
+    s, state, steps = DEFAULT._replace(strategy=PREVIEW, decision_period_s=period), initial_state(), []
     for k in range(10):
         before, state = state, take(measurement(dt=dt), state, s).after
         if state.decisions > before.decisions:
@@ -497,7 +499,7 @@ def test_the_split_is_decided_once_a_period(dt, period, taken):
 
 def test_the_law_remembers_what_it_changed_just_now_and_is_slow_to_take_it_back():
     table = load_policy(share_path("policies/jalalmaab_2015_none_coupled_mu090.npz")).table()
-    s, car, m = DEFAULT._replace(strategy=t.SDP_LOOKAHEAD), CARS["none"], measurement(speed=10.0, demand=1000.0)
+    s, car, m = DEFAULT._replace(strategy=SDP_LOOKAHEAD), CARS["none"], measurement(speed=10.0, demand=1000.0)
 
     def decided(recent, age_s=0.02):
         before = initial_state()._replace(steps=1, decision_age_s=age_s, recent_change=recent)
@@ -519,7 +521,7 @@ def test_equal_split_at_ease_gives_each_motor_a_quarter():
 
 
 def test_what_one_axle_s_motors_cannot_give_the_other_s_do():
-    s = DEFAULT._replace(strategy=t.RULE)
+    s = DEFAULT._replace(strategy=RULE)
     table = TABLE._replace(rule=TABLE.rule * 0.0 + [0.0, 1.0, 0.0, 1.0])
     state = initial_state()
     for _ in range(100):
@@ -541,7 +543,7 @@ def test_a_hot_motor_gives_its_continuous_torque_and_says_so():
 
 def test_an_axle_that_helps_out_up_to_its_limit_is_at_its_limit():
     # The front axle is asked for little and hot; it gives all it can of what the rear one cannot.
-    preview = default_settings("preview")._replace(gate_mode=t.GATE_MODE_OFF)
+    preview = default_settings("preview")._replace(gate_mode=GATE_MODE_OFF)
     table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + 0.2)
     hot = initial_state()._replace(steps=1, front_heat=1.0, applied_share=0.2, decided_share=0.2)
     command, _ = law.step(measurement(speed=5.0, demand=12e3), hot, preview, CAR, table)
@@ -582,7 +584,7 @@ def test_regeneration_on_its_way_down_is_not_driven_against():
 
 @pytest.mark.parametrize("front_share", [0.0, 1.0])
 def test_a_little_friction_is_told_like_much(front_share):
-    preview = default_settings("preview")._replace(gate_mode=t.GATE_MODE_OFF)
+    preview = default_settings("preview")._replace(gate_mode=GATE_MODE_OFF)
     table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + front_share)
     before = initial_state()._replace(steps=1, applied_share=front_share, decided_share=front_share)
     demand = -2.0 * (80.0 + 0.5) * 15.0 / RADIUS
@@ -610,14 +612,14 @@ def test_a_speed_below_zero_is_standstill():
 
 
 def test_hard_braking_is_shared_by_motors_and_friction_brakes():
-    case = settle(measurement(demand=-16e3), DEFAULT._replace(gate_mode=t.GATE_MODE_OFF))
+    case = settle(measurement(demand=-16e3), DEFAULT._replace(gate_mode=GATE_MODE_OFF))
     assert case.command.motor_torque_nm == pytest.approx((-80.0,) * 4)
     assert sum(case.command.friction_torque_nm) == pytest.approx(-16e3 / (15.0 / RADIUS) + 320.0)
     assert case.command.limits == t.LIMIT_REGENERATION
 
 
 def test_regeneration_fades_out_between_its_two_speeds_and_friction_takes_over():
-    off = DEFAULT._replace(gate_mode=t.GATE_MODE_OFF)
+    off = DEFAULT._replace(gate_mode=GATE_MODE_OFF)
     motors = {v: settle(measurement(speed=v, demand=-9000.0), off).command.motor_torque_nm[0] for v in (3.0, 2.0, 1.0)}
     assert motors[3.0] == pytest.approx(-80.0)
     assert motors[2.0] == pytest.approx(-40.0)
@@ -678,7 +680,7 @@ def test_a_brake_pedal_at_rest_holds_the_car_by_friction_alone():
 
 
 def test_the_friction_brakes_own_limit_is_kept_and_said():
-    off = DEFAULT._replace(gate_mode=t.GATE_MODE_OFF)
+    off = DEFAULT._replace(gate_mode=GATE_MODE_OFF)
     case = settle(measurement(demand=-1e6), off)
     assert [a + b for a, b in zip(*case.command[:2], strict=True)] == pytest.approx([-900.0] * 4)
     assert case.command.limits & t.LIMIT_FRICTION_BRAKE

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 from iwm_power_manager.control import types as t
+from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF
 from oracles.physics import regeneration_limit, slip, torque_limit
 from oracles.step import electrical_w
 
@@ -40,8 +41,8 @@ def grip(braking, road, wheel, speed, settings, vehicle):
         rim = max(min(speed * (1.0 - settings.slip_target), speed - LEAST_SLIP_SPEED), 0.0)
     else:
         rim = max(speed / (1.0 - settings.slip_target), speed + LEAST_SLIP_SPEED)
-    change = (rim / vehicle.wheel.radius_m - wheel) / settings.slip_limiter_s
-    torque = road + vehicle.wheel.inertia_kgm2 * change
+    change = (rim / vehicle.front.wheel.radius_m - wheel) / settings.slip_limiter_s
+    torque = road + vehicle.front.wheel.inertia_kgm2 * change
     return max(-torque if braking else torque, 0.0)
 
 
@@ -111,7 +112,7 @@ class Axle:
 
 def step(m, state, settings, vehicle, decide):
     """Both axles, applied and decided share, limit bits; `decide` is the strategy, called with the two slips."""
-    motor, brake, radius = vehicle.motor, vehicle.friction_brake, vehicle.wheel.radius_m
+    motor, brake, radius = vehicle.front.motor, vehicle.front.friction_brake, vehicle.front.wheel.radius_m
     wheels = m.wheel_speed_radps
     first = state.steps == 0
     axles = [
@@ -132,7 +133,7 @@ def step(m, state, settings, vehicle, decide):
         worst = slips[0] if abs(slips[0]) > abs(slips[1]) else slips[1]
         axle.slip = worst if first else low_pass(axle.slip_before, worst, m.dt_s, settings.slip_filter_s)
         if not first:
-            taken = axle.total_before - vehicle.wheel.inertia_kgm2 * (axle.speed - axle.speed_before) / m.dt_s
+            taken = axle.total_before - vehicle.front.wheel.inertia_kgm2 * (axle.speed - axle.speed_before) / m.dt_s
             axle.road = low_pass(axle.road_before, taken, m.dt_s, settings.slip_filter_s)
 
     decided = state.decided_share
@@ -146,7 +147,7 @@ def step(m, state, settings, vehicle, decide):
     for axle in axles:
         edge = settings.critical_slip - (settings.gate_hysteresis if axle.was_gated else 0.0)
         axle.doubtful = abs(abs(axle.slip) - edge) < 1e-12
-        if settings.gate_mode != t.GATE_MODE_OFF and m.power_demand_w != 0.0:
+        if settings.gate_mode != GATE_MODE_OFF and m.power_demand_w != 0.0:
             spinning = settings.gate_driving and not braking and axle.slip > edge
             axle.gated = spinning or (braking and -axle.slip > edge)
     front, rear = axles
@@ -158,7 +159,7 @@ def step(m, state, settings, vehicle, decide):
     for axle in axles:
         axle.conversion = max(axle.speed, max(m.speed_mps * (1.0 - settings.critical_slip), floor) / radius)
         axle.room = brake.max_torque_nm if braking else torque_limit(axle.fast, axle.heat, motor)
-        if settings.gate_mode == t.GATE_MODE_LIMITER:
+        if settings.gate_mode == GATE_MODE_LIMITER:
             worst = min(axle.wheels) if braking else max(axle.wheels)
             axle.grip = grip(braking, axle.road, worst, m.speed_mps, settings, vehicle)
         axle.most = 0.0 if axle.gated else 2.0 * axle.conversion * min(axle.room, axle.grip)

@@ -15,7 +15,7 @@ from bags_helpers import TWIST, ScriptedDrive, float64, topic, twist
 from iwm_power_manager.bags.definitions import typestore
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter
-from iwm_power_manager.control.types import default_settings
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.policy import load_policy, save_policy
@@ -361,14 +361,16 @@ def test_energy_of_a_constant_step_is_power_times_time(drive: Path) -> None:
     ("arguments", "line"),
     [
         (["/none"], "/none: does not exist"),
-        (["{drive}", "--strategy", "best"], "--strategy: 'best' cannot be replayed; allowed: equal | "),
-        (["{drive}", "--strategy", "preview"], "--strategy: 'preview' cannot be replayed"),
+        (["{drive}", "--strategy", "best"], "--strategy: strategy: 'best' is not allowed; allowed: equal | "),
+        (["{drive}", "--strategy", "preview"], "--strategy: strategy: 'preview' is not allowed"),
         (["{drive}", "--strategy", "sdp", "--policy", "/none.npz"], "/none.npz"),
         (["{drive}", "--strategy", "sdp", "--policy", ""], "the strategy needs a policy"),
-        (["{drive}", "--set", "gain=1"], "--set: gain: is no setting of the law; allowed: decision_period_s"),
+        (["{drive}", "--set", "gain=1"], "--set: gain: is no setting of the law; allowed: strategy, decision_period_s"),
         (["{drive}", "--set", "critical_slip=x"], "--set: critical_slip"),
-        (["{drive}", "--set", "gate_mode=x"], "--set: gate_mode: 'x' is unknown; allowed: off | table2 | limiter"),
-        (["{drive}", "--set", "gate_driving=1"], "--set: gate_driving: '1' is neither true nor false"),
+        (["{drive}", "--set", "gate_mode=x"], "--set: gate_mode: 'x' is not allowed; allowed: off | table2 | limiter"),
+        (["{drive}", "--set", "gate_driving=1"], "--set: gate_driving: '1' is not allowed; allowed: true | false"),
+        (["{drive}", "--set", "slip_speed_floor_mps=0"], "slip_speed_floor_mps: '0' is not allowed; allowed: 0.01"),
+        (["{drive}", "--set", "slip_target=0.3"], "slip_target: 0.3 is not allowed; allowed: at most"),
         (["{drive}", "--vehicle", "/none.yaml"], "/none.yaml"),
         (["{drive}", "--mapping", "/none.yaml"], "/none.yaml"),
         (["{drive}", "--friction", "7"], "--friction"),

@@ -56,14 +56,15 @@ class Pair:
 def compiled_law() -> None:
     """Compile the law once, before processes are started that have to answer in time."""
     from iwm_power_manager.control import law
-    from iwm_power_manager.control.types import Measurement, default_settings, initial_state
+    from iwm_power_manager.control.settings import default_settings
+    from iwm_power_manager.control.types import Measurement, initial_state
     from iwm_power_manager.policy import empty_table
     from iwm_power_manager.share import resolve
     from iwm_power_manager.vehicle import load_vehicle
 
     vehicle = load_vehicle(resolve("config/vehicles/jalalmaab_2015.yaml")).params
     measurement = Measurement(1.0, (3.0, 3.0, 3.0, 3.0), 1.0, 0.01, 0.9, 1.0, 1.0, 0.5)
-    law.step(measurement, initial_state(), default_settings(), vehicle, empty_table())
+    law.step(measurement, initial_state(), default_settings("equal"), vehicle, empty_table())
 
 
 @pytest.fixture(scope="module")

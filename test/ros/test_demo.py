@@ -16,8 +16,8 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle

@@ -153,7 +153,7 @@ class TestPowerManager:
         assert config.age_limits_s(VALUES | {"missed_periods": 1}) == (0.01, 0.01, 0.01, 0.1)
 
     def test_the_laws_settings_are_the_defaults_of_the_law(self) -> None:
-        from iwm_power_manager.control.types import default_settings
+        from iwm_power_manager.control.settings import default_settings
 
         assert config.law_settings(VALUES, "sdp") == default_settings("sdp")
 

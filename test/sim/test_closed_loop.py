@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import GATE_MODE_LIMITER, GATE_MODE_OFF, default_settings, initial_state
+from iwm_power_manager.control.types import initial_state
 from iwm_power_manager.cycle import load_cycle, make_cycle
 from iwm_power_manager.model.driver import DriverState, drive, sample
 from iwm_power_manager.model.pedals import full_braking_w

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import default_settings, initial_state
+from iwm_power_manager.control.types import initial_state
 from iwm_power_manager.cycle import load_cycle, make_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.share import resolve

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import make_cycle
 from iwm_power_manager.nodes import power_manager_config
 from iwm_power_manager.share import resolve

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from bags_helpers import write_drive
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import default_settings
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.mdp.demand import Source

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iwm_power_manager.control import types as t
-from iwm_power_manager.control.split import cheapest_share, decide, lookahead_share, rule_share, table_share
+from iwm_power_manager.control import strategies
+from iwm_power_manager.control.settings import default_settings
+from iwm_power_manager.control.split import decide
+from iwm_power_manager.control.strategies import STRATEGIES, instantaneous
+from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import default_settings
-from iwm_power_manager.model.decision import step_cost_and_next
+from iwm_power_manager.model.decision import SLIP_DYNAMIC, step_cost_and_next
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from oracles import splits
@@ -49,6 +55,39 @@ POWER = st.one_of(st.floats(2.0, 30e3), st.floats(-40e3, -2.0))
 SPEED = st.one_of(st.just(0.0), st.floats(0.0, 35.0))
 SLIP = st.floats(-1.2, 0.9)
 SHARE = st.one_of(st.sampled_from(SHARES), st.floats(0.01, 0.99))
+
+
+def situation(power, speed=12.0, front=0.0, rear=0.0, previous=0.3, recent=0.0, friction=0.9, decisions=0):
+    return Situation(
+        power_demand_w=power,
+        speed_mps=speed,
+        front_slip=front,
+        rear_slip=rear,
+        previous_share=previous,
+        recent_change=recent,
+        friction=friction,
+        decisions=decisions,
+    )
+
+
+def rule_share(power, table):
+    return STRATEGIES["rule"].choose(situation(power), default_settings("rule"), CAR, table)
+
+
+def cheapest_share(power, speed, previous, friction, slip_aware, switching, car, table):
+    at = situation(power, speed, previous=previous, friction=friction)
+    return instantaneous.cheapest_share(at, slip_aware, switching, car, table)
+
+
+def table_share(power, speed, front, rear, previous, table):
+    at = situation(power, speed, front, rear, previous)
+    return STRATEGIES["sdp"].choose(at, default_settings("sdp"), CAR, table)
+
+
+def lookahead_share(power, speed, front, rear, previous, tendency, car, table):
+    at = situation(power, speed, front, rear, previous, tendency)
+    tuning = default_settings("sdp_lookahead")._replace(reversal_price=1.0)
+    return STRATEGIES["sdp_lookahead"].choose(at, tuning, car, table)
 
 
 def within_rounding(costs, ours, slack):
@@ -107,7 +146,7 @@ def test_at_equal_cost_the_share_stays():
     )
     car = CARS[0].with_axles(motor=motor)
     assert cheapest_share(4000.0, 12.0, 0.37, 0.9, False, 0.0, car, TABLE) == 0.37
-    assert decide(4000.0, 12.0, 0.0, 0.0, 0.37, 0.0, 0.9, 0, default_settings("instantaneous"), car, TABLE) == 0.37
+    assert decide(situation(4000.0, previous=0.37), default_settings("instantaneous"), car, TABLE) == 0.37
 
 
 def test_a_change_is_made_for_a_saving_beyond_rounding():
@@ -163,6 +202,38 @@ def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, re
     ours = lookahead_share(power, speed, front, rear, previous, tendency, CAR, TABLE)
     costs = splits.bellman((power, speed, front, rear), previous, TABLE, outcome, tendency)
     assert within_rounding(costs, ours, 1e-6)
+
+
+@pytest.mark.parametrize(("axis", "sign"), [(2, 1.0), (2, -1.0), (3, 1.0), (3, -1.0)])
+def test_the_lookahead_keeps_the_front_s_slip_and_the_rear_s_apart(axis, sign):
+    # What follows depends steeply on the slip of one axle alone: the share goes where that axle slips least.
+    slips = np.array([-0.3, 0.0, 0.3])
+    shape = [1, 1, 1, 1, 1]
+    shape[axis] = 3
+    table = empty_table(SHARES)._replace(
+        slip_front=slips if axis == 2 else np.zeros(1),
+        slip_rear=slips if axis == 3 else np.zeros(1),
+        expected_cost_j=(sign * np.array([0.0, 1e6, 2e6])).reshape(shape),
+        discount=1.0,
+        problem=TABLE.problem._replace(slip_model=SLIP_DYNAMIC),
+    )
+    ours = lookahead_share(6000.0, 12.0, 0.05, -0.02, 0.4, 0.0, CAR, table)
+    # Little slip is wanted of an axle that gets nothing, much of one that gets all.
+    wanted_of_front = (sign < 0.0) == (axis == 2)
+    assert ours == (1.0 if wanted_of_front else 0.0)
+
+
+@given(POWER, st.floats(3.0, 30.0), st.floats(-0.15, 0.15), st.floats(-0.15, 0.15), SHARE)
+def test_a_dynamic_problem_s_lookahead_starts_from_each_axle_s_own_slip(power, speed, front, rear, previous):
+    problem = TABLE.problem._replace(slip_model=SLIP_DYNAMIC, dt_s=0.01, alpha=1.0)
+    table = TABLE._replace(problem=problem, switching_cost_j=0.0, switching_fixed_cost_j=0.0)
+
+    def outcome(share):
+        step = step_cost_and_next(power, speed, front, rear, share, CAR, problem)
+        return step.cost_j, step.speed_mps, step.slip_front, step.slip_rear
+
+    costs = splits.bellman((power, speed, front, rear), previous, table, outcome, 0.0)
+    assert within_rounding(costs, lookahead_share(power, speed, front, rear, previous, 0.0, CAR, table), 1e-6)
 
 
 def test_the_lookahead_stays_where_changing_gains_nothing():
@@ -221,7 +292,7 @@ def test_the_latest_changes_weigh_as_much_as_the_settings_say():
         for recent, weight in ((-0.4, 16.0), (0.4, 16.0), (0.4, 0.5), (0.0, 16.0)):
             s = default_settings("sdp_lookahead")._replace(reversal_price=weight)
             priced = table._replace(switching_cost_j=price)
-            ours = decide(3000.0, 12.0, 0.0, 0.0, 0.6, recent, 0.9, 0, s, CAR, priced)
+            ours = decide(situation(3000.0, previous=0.6, recent=recent), s, CAR, priced)
             assert ours == lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.6, weight * recent, CAR, priced)
             chosen.append((recent, weight, price, ours))
     moved = {}
@@ -232,7 +303,7 @@ def test_the_latest_changes_weigh_as_much_as_the_settings_say():
 
 def choose(strategy, power=1500.0, decisions=0, previous=0.3, speed=12.0, friction=0.9, recent=0.0):
     s = default_settings(strategy)
-    return decide(power, speed, 0.01, -0.02, previous, recent, friction, decisions, s, CAR, TABLE)
+    return decide(situation(power, speed, 0.01, -0.02, previous, recent, friction, decisions), s, CAR, TABLE)
 
 
 def test_every_strategy_is_behind_its_name():
@@ -251,20 +322,84 @@ def test_every_strategy_is_behind_its_name():
     assert blind != aware
     assert choose("instantaneous", 9000.0, speed=5.0, friction=0.2) == blind
     assert choose("instantaneous_slip", 9000.0, speed=5.0, friction=0.2) == aware
-    assert set(t.STRATEGIES) == {
-        "equal",
-        "rule",
-        "instantaneous",
-        "instantaneous_slip",
-        "sdp",
-        "sdp_lookahead",
-        "preview",
+
+
+def test_codes_stand_in_bags_and_never_change():
+    known = {name: strategy.code for name, strategy in STRATEGIES.items()}
+    assert known == {
+        "equal": 0,
+        "rule": 1,
+        "instantaneous": 2,
+        "instantaneous_slip": 3,
+        "sdp": 4,
+        "sdp_lookahead": 5,
+        "preview": 6,
     }
+    assert list(known) == sorted(known, key=known.__getitem__)
+    assert [strategies.name_of(code) for code in known.values()] == list(known)
+
+
+def test_two_strategies_need_a_policy_and_one_knows_the_future():
+    assert [name for name, strategy in STRATEGIES.items() if strategy.needs_policy] == ["sdp", "sdp_lookahead"]
+    assert set(STRATEGIES) - set(strategies.drivable()) == {"preview"}
+
+
+def test_a_strategy_that_comes_after_the_law_is_refused():
+    with pytest.raises(ValueError, match="mine: the control law is built already"):
+        strategies.register(Strategy("mine", 99, STRATEGIES["equal"].choose))
+
+
+_MINE = """
+from iwm_power_manager.control.strategy import Strategy
+from iwm_power_manager.jit import kernel
+
+@kernel
+def choose(situation, settings, vehicle, policy):
+    return 0.25 if situation.front_slip > situation.rear_slip else 0.75
+
+STRATEGY = Strategy("toward_grip", 40, choose)
+"""
+_DRIVE = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import pytest
+from iwm_power_manager.control import strategies
+import toward_grip
+strategies.register(toward_grip.STRATEGY)
+with pytest.raises(ValueError, match="toward_grip has code 40"):
+    strategies.register(toward_grip.STRATEGY._replace(name="another"))
+from iwm_power_manager.control.settings import parse, default_settings
+from iwm_power_manager.control import law
+from iwm_power_manager.control.table import empty_table
+from iwm_power_manager.control.types import Measurement, initial_state
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+assert parse("--strategy", "strategy", "toward_grip") == 40
+car = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+rolling = 15.0 / car.front.wheel.radius_m
+for front, rear, share in ((1.05, 1.0, 0.25), (1.0, 1.05, 0.75)):
+    measurement = Measurement(
+        speed_mps=15.0, wheel_speed_radps=(front * rolling,) * 2 + (rear * rolling,) * 2, power_demand_w=4000.0,
+        dt_s=0.01, friction=0.9, discharge_limit_w=47500.0, charge_limit_w=47500.0, soc=0.5,
+    )
+    command, _ = law.step(measurement, initial_state(), default_settings("toward_grip"), car, empty_table())
+    print(command.decided_share)
+"""
+
+
+def test_a_strategy_in_a_file_of_its_own_is_registered_and_drives(tmp_path):
+    (tmp_path / "toward_grip.py").write_text(_MINE)
+    (tmp_path / "drive.py").write_text(_DRIVE)
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    made = subprocess.run(
+        [sys.executable, str(tmp_path / "drive.py"), str(tmp_path)], capture_output=True, text=True, env=environment
+    )
+    assert made.stdout.split() == ["0.25", "0.75"], made.stderr
 
 
 def test_a_strategy_the_law_does_not_know_is_equal_split():
     unknown = default_settings()._replace(strategy=99)
-    assert decide(1500.0, 12.0, 0.01, -0.02, 0.3, 0.0, 0.9, 0, unknown, CAR, TABLE) == 0.5
+    assert decide(situation(1500.0), unknown, CAR, TABLE) == 0.5
 
 
 def test_the_preview_plays_its_schedule_and_holds_the_last_entry():
