@@ -1,3 +1,3 @@
 """Stochastic power management for cars with in-wheel motors."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

@@ -44,8 +44,8 @@ DISTRIBUTIONS = {"yaml": "pyyaml"}
 
 #: Parts that know numbers and files only: usable, and tested, where no ROS is.
 ROS_FREE = [
-    "actuation", "bags", "control", "cycle.py", "errors.py", "files.py", "grid.py", "jit.py", "mdp", "model",
-    "policy.py", "share.py", "vehicle.py",
+    "bags", "control", "cycle.py", "errors.py", "files.py", "grid.py", "jit.py", "mdp", "model",
+    "policy.py", "replay", "share.py", "signals", "vehicle.py",
 ]  # fmt: skip
 
 
