@@ -56,7 +56,7 @@ SETTINGS = st.builds(
     slip_limiter_s=st.sampled_from([0.03, 0.1]),
     slip_speed_floor_mps=st.sampled_from([0.5, 1.0]),
 )
-VEHICLE = SimpleNamespace(wheel=SimpleNamespace(radius_m=RADIUS, inertia_kgm2=INERTIA))
+VEHICLE = SimpleNamespace(front=SimpleNamespace(wheel=SimpleNamespace(radius_m=RADIUS, inertia_kgm2=INERTIA)))
 
 
 @given(
