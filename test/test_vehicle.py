@@ -11,15 +11,17 @@ import pytest
 
 from iwm_power_manager import files, vehicle
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.model.motor import electrical_power_w, enabled_loss_w
+from iwm_power_manager.model.motor import electrical_power_w, enabled_loss_w, idle_drag_nm
+from iwm_power_manager.motor_map import load_efficiency_map
 from iwm_power_manager.share import share_path
-from iwm_power_manager.vehicle import load_efficiency_map, load_vehicle, with_idle_drive, with_params
+from iwm_power_manager.vehicle import load_vehicle, with_idle_drive, with_params
 from oracles.step import loss_w
 
 FOLDER = share_path("config/vehicles")
 PAPER = FOLDER / "jalalmaab_2015.yaml"
 MAP = share_path("config/motors/siemens_pm_7500w.csv")
 CONTENT = files.read_yaml(PAPER)
+PAPER_CAR = load_vehicle(PAPER)
 
 
 def _numbers(content, path=()):
@@ -105,8 +107,11 @@ def test_the_motor_s_loss_section_is_checked_too(refused):
 @pytest.mark.parametrize(
     ("path", "value", "key", "allowed"),
     [
-        (("format",), 2, "format", "1"),
-        (("format",), "1", "format", "1"),
+        (("format",), 3, "format", "1 | 2"),
+        (("format",), "1", "format", "1 | 2"),
+        (("format",), True, "format", "1 | 2"),
+        (("front",), {}, "front", "format: 2"),
+        (("gear",), {"ratio": 2.0}, "gear", "format: 2"),
         (("name",), "", "name", "text that is not empty"),
         (("name",), "  ", "name", "text that is not empty"),
         (("name",), 5, "name", "text that is not empty"),
@@ -204,6 +209,117 @@ def test_what_is_no_vehicle_file_is_refused_with_its_name(tmp_path, text):
         load_vehicle(tmp_path / "nowhere.yaml")
 
 
+# --- Front and rear --------------------------------------------------------------------------------------------------
+
+PARTS = ("wheel", "tyre", "motor", "friction_brake")
+
+
+def per_axle(**changes):
+    """The car in format 2 with a section for each axle; changes as `rear={"motor": {...}}`."""
+    content = {key: copy.deepcopy(value) for key, value in CONTENT.items() if key not in PARTS}
+    content["format"] = 2
+    for axle in ("front", "rear"):
+        content[axle] = {part: copy.deepcopy(CONTENT[part]) for part in PARTS}
+        content[axle].update(changes.get(axle, {}))
+    return content
+
+
+@pytest.fixture
+def loaded(monkeypatch):
+    """The car a content describes."""
+
+    def load(content):
+        monkeypatch.setattr(vehicle.files, "read_yaml", lambda path: content)
+        return load_vehicle(PAPER)
+
+    return load
+
+
+def same(one, two):
+    """Equal to the last bit, arrays included."""
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, two)
+    if isinstance(one, tuple):
+        return all(same(a, b) for a, b in zip(one, two, strict=True))
+    return one == two
+
+
+def test_equal_sections_are_the_car_with_one_section_for_both(loaded):
+    one = PAPER_CAR
+    for content in (per_axle(), {**CONTENT, "format": 2}, {**CONTENT, "format": 2, "gear": {"ratio": 1.0}}):
+        other = loaded(content)
+        assert same(one.params, other.params)
+        assert one.hash == other.hash
+
+
+def test_each_axle_takes_its_own_section(loaded):
+    wide = {**CONTENT["motor"], "peak_torque_nm": 300.0}
+    car = loaded(per_axle(rear={"motor": wide, "track_width_m": 1.6})).params
+    assert (car.front.motor.peak_torque_nm, car.rear.motor.peak_torque_nm) == (200.0, 300.0)
+    assert car.rear.track_width_m == 1.6
+    assert car.front.wheel == car.rear.wheel
+    mixed = {
+        **changed(("motor",), drop=True),
+        "format": 2,
+        "front": {"motor": CONTENT["motor"]},
+        "rear": {"motor": wide},
+    }
+    assert loaded(mixed).params.rear.motor.peak_torque_nm == 300.0
+    assert loaded(mixed).hash != PAPER_CAR.hash
+
+
+def test_a_part_stands_once_for_each_axle(refused):
+    missing = per_axle()
+    del missing["rear"]["motor"]
+    assert (refused(missing).key, refused(missing).problem) == ("rear.motor", "is missing")
+    assert refused({**CONTENT, "format": 2, "front": {"motor": CONTENT["motor"]}}).key == "front.motor"
+    assert (
+        refused({**per_axle(), "gear": {"ratio": 2.0}, "front": {**per_axle()["front"], "gear": {"ratio": 2.0}}}).key
+        == "front.gear"
+    )
+    wrong = per_axle(rear={"wheel": {"radius_m": 0.33, "inertia_kgm2": -1.0}})
+    assert refused(wrong).key == "rear.wheel.inertia_kgm2"
+    assert refused(per_axle(front={"track_width_m": 0.1})).key == "front.track_width_m"
+    assert refused(per_axle(front={"wing": 1})).key == "front.wing"
+    assert refused({**per_axle(), "rear": 5}).problem == "5 is no mapping"
+
+
+def test_what_the_two_track_plant_needs_is_derived_where_it_is_not_given(loaded):
+    car = PAPER_CAR.params
+    assert car.chassis.yaw_inertia_kgm2 == pytest.approx(800.0 * 0.92 * 0.92)
+    assert (car.chassis.front_roll_share, car.chassis.steering_ratio) == (0.5, 15.0)
+    assert car.front.track_width_m == car.rear.track_width_m == pytest.approx(2.4 * 0.6)
+    low = loaded(changed(("chassis", "cg_height_m"), 0.3)).params
+    assert low.front.track_width_m == pytest.approx(0.56 * 1.84)
+    given = loaded(changed(("chassis", "yaw_inertia_kgm2"), 900.0))
+    assert given.params.chassis.yaw_inertia_kgm2 == 900.0
+    assert given.hash == PAPER_CAR.hash
+
+
+def test_a_motor_behind_a_gear_is_what_the_wheel_sees(loaded):
+    ratio = 4.0
+    geared = loaded({**CONTENT, "format": 2, "gear": {"ratio": ratio, "rotor_inertia_kgm2": 0.01}}).params.front
+    motor, wheel = PAPER_CAR.params.front.motor, PAPER_CAR.params.front.wheel
+    assert geared.motor.peak_torque_nm == ratio * motor.peak_torque_nm
+    assert geared.motor.max_power_w == motor.max_power_w
+    assert geared.wheel.inertia_kgm2 == pytest.approx(wheel.inertia_kgm2 + 0.16)
+    for torque, speed in ((30.0, 20.0), (-30.0, 20.0), (5.0, 90.0)):
+        at_wheel = electrical_power_w(ratio * torque, speed / ratio, geared.motor)
+        assert at_wheel == pytest.approx(electrical_power_w(torque, speed, motor))
+    assert idle_drag_nm(0.0, 10.0, geared.motor) == pytest.approx(ratio * idle_drag_nm(0.0, 10.0 * ratio, motor))
+
+
+@pytest.mark.parametrize("torque", [-150.0, -40.0, -3.0, 3.0, 40.0, 150.0])
+@pytest.mark.parametrize("content", [CONTENT, files.read_yaml(FOLDER / "jalalmaab_2015_map.yaml")], ids=["loss", "map"])
+def test_a_gear_takes_its_part_of_the_power_in_the_direction_it_flows(torque, content, loaded):
+    ratio, efficiency, speed = 4.0, 0.95, 40.0
+    plain = loaded({**content, "format": 2}).params.front.motor
+    geared = loaded({**content, "format": 2, "gear": {"ratio": ratio, "efficiency": efficiency}}).params.front.motor
+    at_wheel = torque * ratio * (efficiency if torque > 0.0 else 1.0 / efficiency)
+    expected = electrical_power_w(torque, speed, plain)
+    assert electrical_power_w(at_wheel, speed / ratio, geared) == pytest.approx(expected, rel=2e-3, abs=1.0)
+
+
 # --- What comes out --------------------------------------------------------------------------------------------------
 
 
@@ -228,7 +344,8 @@ def test_every_number_of_the_file_arrives_in_the_parameters(path, monkeypatch):
     after = load_vehicle(PAPER)
     holders = [car.params.front if section in car.params.front._fields else car.params for car in (before, after)]
     old, new = (getattr(holder, section)._asdict() for holder in holders)
-    different = [name for name, x in old.items() if not np.array_equal(x, new[name])]
+    # Yaw inertia is derived from mass and distances.
+    different = [name for name, x in old.items() if not np.array_equal(x, new[name]) and name != "yaw_inertia_kgm2"]
     assert len(different) == 1
     field = "coefficients" if section == "tyre" and key != "slip_speed_floor_mps" else key
     assert different[0] == field or "loss" in path
@@ -273,10 +390,10 @@ def test_shipped_vehicles_differ_from_the_paper_s_car_in_the_motor_only():
     car = load_vehicle(PAPER).params
     for name in ("direct_drive_hub", "jalalmaab_2015_map"):
         other = load_vehicle(FOLDER / f"{name}.yaml").params
-        for mine, its in ((car, other), (car.front, other.front), (car.rear, other.rear)):
-            for section in (s for s in mine._fields if s not in ("motor", "front", "rear")):
-                for ours, theirs in zip(getattr(mine, section), getattr(its, section), strict=True):
-                    assert np.array_equal(ours, theirs)
+        for axle in ("front", "rear"):
+            mine = getattr(car, axle)._replace(motor=None)
+            assert same(mine, getattr(other, axle)._replace(motor=None))
+        assert same(car._replace(front=(), rear=()), other._replace(front=(), rear=()))
 
 
 def test_the_hub_motor_has_its_own_losses():

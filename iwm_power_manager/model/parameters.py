@@ -19,7 +19,7 @@ IDLE_DRIVES: dict[str, int] = {"none": IDLE_NONE, "drag": IDLE_DRAG, "enabled": 
 
 
 class Chassis(NamedTuple):
-    """Body: road load (eq. 3-5) and load transfer (eq. 7, 8)."""
+    """Body: road load (eq. 3-5), load transfer (eq. 7, 8), and what only a plant with two tracks reads."""
 
     mass_kg: float
     frontal_area_m2: float
@@ -29,6 +29,9 @@ class Chassis(NamedTuple):
     front_axle_to_cg_m: float
     rear_axle_to_cg_m: float
     cg_height_m: float
+    yaw_inertia_kgm2: float
+    front_roll_share: float
+    steering_ratio: float
 
 
 class Wheel(NamedTuple):
@@ -51,7 +54,7 @@ class Tyre(NamedTuple):
 
 
 class Motor(NamedTuple):
-    """One in-wheel motor with its inverter (eq. 14-16, 19, 42).
+    """One motor with its inverter, as the wheel has it (eq. 14-16, 19, 42): a gear between them is reckoned in.
 
     Losses come from the five coefficients, or, where `map_loss_w` is not empty, from the map: loss in W over
     `map_speed_radps` (rows) and `map_torque_nm` (columns, from generating to driving).
@@ -126,6 +129,7 @@ class Axle(NamedTuple):
     tyre: Tyre
     motor: Motor
     friction_brake: FrictionBrake
+    track_width_m: float
 
 
 class VehicleParams(NamedTuple):
