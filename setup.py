@@ -75,6 +75,7 @@ setup(
     package_data={"iwm_power_manager": ["py.typed"], "iwm_sim": ["py.typed"], "iwm_sim.study": ["assets/*"]},
     data_files=shared_files(),
     install_requires=[
+        "jinja2",
         "lz4",
         "matplotlib",
         "mcap",

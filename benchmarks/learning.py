@@ -29,7 +29,7 @@ from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.demand import chain_of, signal_source, source_of
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.share import share_path
-from iwm_power_manager.tools.solve_policy import solve_one
+from iwm_power_manager.solve import solve_one
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.closed_loop import run
 from iwm_sim.study.driving import cores, on_all_cores

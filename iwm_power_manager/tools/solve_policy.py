@@ -9,12 +9,10 @@ import argparse
 import dataclasses
 import json
 import math
-import re
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -29,18 +27,17 @@ from iwm_power_manager.mdp.demand import (
     DemandChain,
     Source,
     chain_of,
-    signal_source,
     source_of,
 )
 from iwm_power_manager.mdp.demand_counts import transitions_source
-from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
-from iwm_power_manager.mdp.problem import Problem, load_problem
+from iwm_power_manager.mdp.policy_iteration import Iteration
+from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.mdp.transitions import build_model
 from iwm_power_manager.model.parameters import IDLE_DRIVES
-from iwm_power_manager.policy import Policy, cost_quantum_j, load_policy, make_policy, save_policy
+from iwm_power_manager.policy import load_policy
+from iwm_power_manager.replay.demand import drive_source, read_drives
 from iwm_power_manager.share import resolve
-from iwm_power_manager.signals.mapping import load_mapping
-from iwm_power_manager.signals.recorded import RecordedDrive, read_signal
+from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
 from iwm_power_manager.tools.solver_figures import draw_solution
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
@@ -76,15 +73,6 @@ file, byte for byte. Results go to stdout, progress to stderr.
 
 exit codes: 0 solved or checked, 1 a policy missed its bound, 2 bad arguments or files, 130 interrupted
 """
-
-
-class Solved(NamedTuple):
-    """One policy, where it was written and what it took."""
-
-    policy: Policy
-    path: Path
-    build_s: float
-    solve_s: float
 
 
 def parser() -> argparse.ArgumentParser:
@@ -176,7 +164,8 @@ def _solve(options: argparse.Namespace) -> int:
 
     solved = []
     for friction, path in zip(frictions, paths, strict=True):
-        solved.append(solve_one(problem, vehicle, friction, chain, sources, path, options.quiet))
+        with _Progress(f"friction {friction:g}", problem.tolerance_j, options.quiet) as progress:
+            solved.append(solve_one(problem, vehicle, friction, chain, sources, path, progress.update))
         say(_convergence_text(solved[-1]))
     if options.plot:
         draw_solution([result.policy for result in solved], Path(options.plot))
@@ -196,12 +185,6 @@ def _demand_arguments(options: argparse.Namespace) -> None:
     check_number("arguments", "--bag-weight", options.bag_weight, 0.0, 1e6, above=True)
 
 
-def load_grid(name: str) -> Problem:
-    """A grid of the package by its name, or of a file."""
-    preset = resolve(f"config/grids/{name}.yaml")
-    return load_problem(preset if preset.exists() else resolve(name))
-
-
 def _problem(options: argparse.Namespace) -> Problem:
     problem = load_grid(options.grid)
     if options.discount is None:
@@ -215,74 +198,6 @@ def _sources(options: argparse.Namespace, problem: Problem, vehicle: Vehicle) ->
     drives = read_drives(options.bag, options.mapping, vehicle, "solve_policy")
     sources += [drive_source(name, drive, problem, options.bag_weight) for name, drive in drives]
     return sources + [transitions_source(path, problem.dt_s, options.bag_weight) for path in options.transitions]
-
-
-def read_drives(
-    bags: Sequence[str], mapping: str | None, vehicle: Vehicle, command: str
-) -> list[tuple[str, RecordedDrive]]:
-    """Name and content of recorded drives; what is wrong with them goes to stderr in the name of a command."""
-    known = load_mapping(resolve(mapping) if mapping else None) if bags else None
-    drives = []
-    for path in bags:
-        drive = read_signal(path, known, vehicle.params)
-        for damage in drive.damage:
-            print(f"{command}: warning: {path}: {damage}", file=sys.stderr)
-        if drive.bad_messages:
-            print(f"{command}: warning: {path}: {drive.bad_messages} bad messages left out", file=sys.stderr)
-        drives.append((Path(path).name, drive))
-    return drives
-
-
-def drive_source(name: str, drive: RecordedDrive, problem: Problem, weight: float) -> Source:
-    """A recorded drive as a source of demand."""
-    return signal_source(name, drive.time_s, drive.power_demand_w, problem.dt_s, weight, drive.speed_mps)
-
-
-def targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequence[float]) -> list[Path]:
-    """Where each policy goes; a folder is made, a file is for one policy only."""
-    if len(set(frictions)) != len(frictions):
-        raise ConfigError("arguments", "--friction", "names a value twice")
-    if output.suffix == ".npz":
-        if len(frictions) > 1:
-            raise ConfigError(
-                "arguments", "--output", f"{output} is one file for {len(frictions)} policies", "a folder"
-            )
-        return [output]
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError("arguments", "--output", f"{output}: {error.strerror}", "a folder or a .npz file") from None
-    stem = re.sub(r"[^a-z0-9]+", "_", f"{vehicle.name} {vehicle.idle_drive} {problem.name}".lower()).strip("_")
-    return [output / f"{stem}_mu{round(friction * 100):03d}.npz" for friction in frictions]
-
-
-def solve_one(
-    problem: Problem,
-    vehicle: Vehicle,
-    friction: float,
-    chain: DemandChain,
-    sources: Sequence[Source],
-    path: Path,
-    quiet: bool = True,
-) -> Solved:
-    """Solve for one road, write the policy, and say what it took."""
-    started = time.perf_counter()
-    problem = problem.on_road(friction)
-    with _Progress(f"friction {friction:g}", problem.tolerance_j, quiet) as progress:
-        model = build_model(problem, vehicle.params, friction, chain.matrix)
-        built = time.perf_counter()
-        solution: Solution = solve(
-            model,
-            problem.share,
-            # What rounding the stored cost-to-go adds is part of the promise.
-            problem.tolerance_j - cost_quantum_j(problem.tolerance_j) / 2.0,
-            problem.max_iterations,
-            progress.update,
-        )
-        done = time.perf_counter()
-    policy = make_policy(problem, vehicle, friction, chain, sources, solution)
-    save_policy(policy, path)
-    return Solved(policy, path, built - started, done - built)
 
 
 class _Progress:

@@ -30,10 +30,10 @@ from iwm_power_manager.errors import IwmError
 from iwm_power_manager.ros import messages as m
 from iwm_power_manager.share import share_path
 from iwm_sim.campaigns.witness import Witness
+from iwm_sim.dds_drive import environment, node_command
 from iwm_sim.domains import claimed_domain
 from iwm_sim.drive import load_run
 from iwm_sim.processes import Child, ChildError, Children
-from iwm_sim.tools.demo import environment, node_command
 
 _RATE_HZ = 100.0
 _PERIOD_S = 1.0 / _RATE_HZ

@@ -39,6 +39,14 @@ FloatArray = npt.NDArray[np.float64]
 CYCLES = ("ftp75", "hwfet")
 PAPER_RESISTANCE_OHM = 0.063
 
+#: What the circuits of a `Fit` are.
+CIRCUITS = {
+    "nominal": "R fitted at the nominal voltage",
+    "plant": "R fitted at the plant's mean voltage",
+    "free": "R and voltage fitted",
+    "file": "as in the vehicle's file",
+}
+
 #: Resistances searched, ohm.
 _HIGHEST_OHM = 0.5
 
@@ -83,30 +91,24 @@ class Fit(NamedTuple):
     def text(self) -> str:
         """The result in lines for a terminal."""
         names = list(self.nominal.rmse_by_cycle)
-        head = f"{'circuit':<32}{'R, ohm':>10}{'Voc, V':>10}{'RMSE, % SoC':>14}" + "".join(f"{n:>12}" for n in names)
+        head = f"{'circuit':<38}{'R, ohm':>10}{'Voc, V':>10}{'RMSE, % SoC':>14}" + "".join(f"{n:>12}" for n in names)
         lines = [head]
-        for name, made in (
-            ("R fitted, nominal voltage", self.nominal),
-            ("R fitted, plant's mean voltage", self.plant),
-            ("R and voltage fitted", self.free),
-            ("vehicle file", self.file),
-        ):
+        for name, made in self.estimates().items():
             lines.append(
-                f"{name:<32}{made.resistance_ohm:>10.4f}{made.voltage_v:>10.2f}{100.0 * made.rmse:>14.5f}"
+                f"{CIRCUITS[name]:<38}{made.resistance_ohm:>10.4f}{made.voltage_v:>10.2f}{100.0 * made.rmse:>14.5f}"
                 + "".join(f"{100.0 * made.rmse_by_cycle[n]:>12.5f}" for n in names)
             )
         lines.append(f"the paper's estimate: {PAPER_RESISTANCE_OHM} ohm")
         return "\n".join(lines)
 
-    def numbers(self) -> dict[str, Any]:
-        """The result as plain values."""
-        return {
-            "nominal": self.nominal._asdict(),
-            "plant": self.plant._asdict(),
-            "free": self.free._asdict(),
-            "file": self.file._asdict(),
-            "paper_resistance_ohm": PAPER_RESISTANCE_OHM,
-        }
+    def estimates(self) -> dict[str, Estimate]:
+        """The four circuits by name."""
+        return {"nominal": self.nominal, "plant": self.plant, "free": self.free, "file": self.file}
+
+    def to_json(self) -> dict[str, Any]:
+        """The estimates as plain values, with the paper's beside them."""
+        made = {name: estimate._asdict() for name, estimate in self.estimates().items()}
+        return {**made, "paper_resistance_ohm": PAPER_RESISTANCE_OHM}
 
 
 def soc_of_model(

@@ -1,4 +1,4 @@
-"""What a case is: one drive of one car over one cycle on one road with one strategy; and what its result amounts to.
+"""What a case is: one drive of one car over one cycle on one road with one strategy.
 
 A case holds file names and plain numbers only, so that it travels to a worker process as it is. Everything it needs is
 loaded there, once for each worker. The same case always gives the same numbers, whoever drives it.
@@ -12,7 +12,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -38,9 +38,6 @@ POLICY_STRATEGIES = frozenset(name for name, known in STRATEGIES.items() if know
 
 #: Every saving is against this one.
 REFERENCE = "equal"
-
-#: Energies of two runs are compared if the distances differ by no more than this.
-SAME_DISTANCE = 1e-3
 
 #: The cycle the generalized rule is fitted to, as in the paper.
 RULE_CYCLE = "config/cycles/ftp75.csv"
@@ -298,91 +295,3 @@ def save_series(folder: Path | str, made: Result) -> None:
     stream = io.BytesIO()
     np.savez_compressed(stream, allow_pickle=False, **made.series)
     atomic_write(Path(folder) / name, stream.getvalue())
-
-
-# --- what a result amounts to beside others -------------------------------------------------------------------------
-
-
-def comparable(one: Metrics, other: Metrics) -> bool:
-    """Whether two runs covered the same distance, so that their energies may be compared."""
-    return abs(one.distance_m - other.distance_m) <= SAME_DISTANCE * other.distance_m
-
-
-def saving_percent(one: Metrics, reference: Metrics) -> float | None:
-    """Energy saved against a reference, %; None where the distances differ."""
-    if not comparable(one, reference) or reference.energy_wh <= 0.0:
-        return None
-    return 100.0 * (1.0 - one.energy_wh / reference.energy_wh)
-
-
-def rows(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """A row of plain values for each result, with its saving against the equal split of the same drive.
-
-    Results belong together if they differ in nothing but strategy, label, policy and law settings. `share_of_possible`
-    is the saving as a part of that of `preview`, where both are there and there is anything to save.
-    """
-    references: dict[tuple[Any, ...], Metrics] = {}
-    bounds: dict[tuple[Any, ...], Metrics] = {}
-    for made in results:
-        group = _group(made.case)
-        if made.case.strategy == REFERENCE:
-            references.setdefault(group, made.metrics)
-        if made.case.strategy == "preview":
-            bounds.setdefault(group, made.metrics)
-    return [_row(made, references.get(_group(made.case)), bounds.get(_group(made.case))) for made in results]
-
-
-def _group(case: Case) -> tuple[Any, ...]:
-    return (
-        *(case.cycle, case.vehicle, case.idle_drive, case.friction, case.dt_s, case.substeps, case.soc),
-        *(case.assumed_friction, case.noise, case.car, case.plant),
-    )
-
-
-#: A possible saving below this, %, has no parts.
-_LEAST_POSSIBLE_PERCENT = 0.01
-
-
-def _row(made: Result, reference: Metrics | None, bound: Metrics | None) -> dict[str, Any]:
-    case = made.case
-    saving = saving_percent(made.metrics, reference) if reference else None
-    possible = saving_percent(bound, reference) if reference and bound else None
-    share = None
-    if saving is not None and possible is not None and possible > _LEAST_POSSIBLE_PERCENT:
-        share = saving / possible
-    policy = policy_of(case.policy) if case.policy else None
-    vehicle = vehicle_of(case.vehicle, case.idle_drive, case.car)
-    return {
-        "cycle": cycle_of(case.cycle).name,
-        "friction": case.friction,
-        "strategy": case.strategy,
-        "label": case.name,
-        "idle_drive": vehicle.idle_drive,
-        **{name: _plain(value) for name, value in made.metrics._asdict().items()},
-        "saving_percent": saving,
-        "share_of_possible": share,
-        "same_distance_as_equal": comparable(made.metrics, reference) if reference else None,
-        "assumed_friction": case.told_friction,
-        "dt_s": case.dt_s,
-        "initial_soc": case.soc,
-        "noise": case.noise._asdict(),
-        "plant_changes": {f"{c.section}.{c.name}": c.value for c in case.plant},
-        "settings": case.settings._replace(strategy=STRATEGIES[case.strategy].code)._asdict(),
-        "rule": list(case.rule) or None,
-        "preview_switching_cost_j": (
-            [case.switching_cost_j, case.switching_fixed_cost_j] if case.strategy == "preview" else None
-        ),
-        "vehicle": vehicle.name,
-        "vehicle_hash": vehicle.hash,
-        "cycle_sha256": cycle_of(case.cycle).sha256,
-        "policy_checksum": policy.checksum if policy else None,
-        "policy_friction": policy.friction if policy else None,
-    }
-
-
-def _plain(value: Any) -> Any:
-    """A metric as JSON takes it: NaN (nothing was driven) is null."""
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    number = float(value)
-    return number if np.isfinite(number) else None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,24 +12,11 @@ from numpy.typing import NDArray
 from iwm_power_manager.control.types import GATE_NAMES
 from iwm_sim.closed_loop import Run
 from iwm_sim.metrics import MOVING_MPS, Metrics
-from iwm_sim.study.report import Block, Chart, Column, Page, Panel, Series, Settings, Table, Text, Tile, Tiles
+from iwm_sim.study.report import Block, Chart, Column, Page, Panel, Series, Settings, Table, Text, Tile, Tiles, Verdict
 from iwm_sim.study.report import format_value as shown
+from iwm_sim.study.rows import finite, saving_percent
 
 BLUE, VERMILION, GREEN, PURPLE, OCHRE, SKY, GREY, BLACK = range(8)
-
-COLUMNS = (
-    Column("strategy", "Strategy"),
-    Column("distance_km", "Distance", "km", 3),
-    Column("wh_per_km", "Energy", "Wh/km", 2, best="low"),
-    Column("delta_soc_percent", "ΔSoC", "%", 3, best="low"),
-    Column("saving_percent", "Saving", "%", 2),
-    Column("rms_speed_error_mps", "RMS speed error", "m/s", 3),
-    Column("min_slip", "Lowest slip", "", 3),
-    Column("max_slip", "Highest slip", "", 3),
-    Column("share_changes_per_min", "Front share changes", "1/min", 1),
-    Column("trace_held", "Trace"),
-    Column("made", "Run"),
-)
 
 
 class Driven(NamedTuple):
@@ -48,23 +35,61 @@ class Driven(NamedTuple):
     metrics: Metrics
 
 
-def row(driven: Driven, reference: Driven) -> dict[str, Any]:
-    """A row of `COLUMNS`, and of the JSON result: metrics, with the saving against the reference.
+@dataclass(frozen=True)
+class DriveRow:
+    """A run as tables show it, and as the JSON result has it.
 
-    Energies are compared only between runs that covered the same distance to 0.1 %; otherwise the saving is None.
+    Attributes
+    ----------
+    strategy, made : as in `Driven`
+    metrics : what was measured
+    saving_percent : against the reference; None for itself, and where the distances differ
+    share_changes_per_min : None where the law's decisions are not known
     """
-    metrics = driven.metrics
-    other = reference.metrics
-    saving = None
-    same_distance = abs(metrics.distance_m - other.distance_m) <= 1e-3 * other.distance_m
-    if driven is not reference and same_distance and other.energy_wh != 0.0:
-        saving = 100.0 * (1.0 - metrics.energy_wh / other.energy_wh)
-    values = metrics._asdict() | {"distance_km": metrics.distance_m / 1000.0, "saving_percent": saving}
-    if np.isnan(driven.run["decided_share"]).all():
-        values["share_changes_per_min"] = None
-    # JSON knows no NaN, and a table has a sign for what is missing.
-    values = {name: None if value is None or math.isnan(value) else value for name, value in values.items()}
-    return {"strategy": driven.strategy, "made": driven.made, **values}
+
+    strategy: str
+    made: str
+    metrics: Metrics
+    saving_percent: float | None
+    share_changes_per_min: float | None
+
+    def to_json(self) -> dict[str, Any]:
+        """The row as flat plain values; JSON knows no NaN, so what is missing is null."""
+        return {
+            "strategy": self.strategy,
+            "made": self.made,
+            **{name: finite(value) for name, value in self.metrics._asdict().items()},
+            "distance_km": self.metrics.distance_m / 1000.0,
+            "saving_percent": self.saving_percent,
+            "share_changes_per_min": self.share_changes_per_min,
+        }
+
+
+COLUMNS: tuple[Column[DriveRow], ...] = (
+    Column("Strategy", lambda row: row.strategy),
+    Column("Distance", lambda row: row.metrics.distance_m / 1000.0, "km", 3),
+    Column("Energy", lambda row: row.metrics.wh_per_km, "Wh/km", 2, best="low"),
+    Column("ΔSoC", lambda row: row.metrics.delta_soc_percent, "%", 3, best="low"),
+    Column("Saving", lambda row: row.saving_percent, "%", 2),
+    Column("RMS speed error", lambda row: row.metrics.rms_speed_error_mps, "m/s", 3),
+    Column("Lowest slip", lambda row: row.metrics.min_slip, decimals=3),
+    Column("Highest slip", lambda row: row.metrics.max_slip, decimals=3),
+    Column("Front share changes", lambda row: row.share_changes_per_min, "1/min", 1),
+    Column("Trace", lambda row: Verdict(row.metrics.trace_held, "held" if row.metrics.trace_held else "lost")),
+    Column("Run", lambda row: row.made),
+)
+
+
+def row(driven: Driven, reference: Driven) -> DriveRow:
+    """A run beside the reference; energies are compared only between runs over the same distance (0.1 %)."""
+    known = not np.isnan(driven.run["decided_share"]).all()
+    return DriveRow(
+        strategy=driven.strategy,
+        made=driven.made,
+        metrics=driven.metrics,
+        saving_percent=None if driven is reference else saving_percent(driven.metrics, reference.metrics),
+        share_changes_per_min=finite(driven.metrics.share_changes_per_min) if known else None,
+    )
 
 
 def drive_page(
@@ -90,7 +115,7 @@ def drive_page(
     """
     rows = [row(driven, reference), row(reference, reference)]
     metrics = driven.metrics
-    saving = rows[0]["saving_percent"]
+    saving = rows[0].saving_percent
     if driven.strategy == reference.strategy:
         lead = f"{metrics.distance_m / 1000:.2f} km with {driven.strategy} distribution"
     elif saving is None:
@@ -106,7 +131,7 @@ def drive_page(
     lost = f"the car left the EPA tolerance by up to {metrics.trace_excess_mps:.2f} m/s: its energy may not be compared"
     blocks: list[Block] = [
         Tiles(_tiles(rows[0], rows[1])),
-        Table("Result", COLUMNS, rows, note=" ".join(remarks)),
+        Table("Result", COLUMNS, rows, " ".join(remarks), lambda made: made.metrics.trace_held),
         Chart("The drive", driven.run["time_s"], _panels(driven, reference, critical_slip)),
         Text(
             "Powers are those of the commands at the wheels, braking negative. Slip is the wheel's, drawn above "
@@ -119,15 +144,18 @@ def drive_page(
     return Page(f"{driven.strategy} on {cycle}", lead, blocks, metrics.trace_held, held if metrics.trace_held else lost)
 
 
-def _tiles(row: Mapping[str, Any], other: Mapping[str, Any]) -> list[Tile]:
-    name = other["strategy"]
+def _tiles(row: DriveRow, other: DriveRow) -> list[Tile]:
+    name, metrics, beside = other.strategy, row.metrics, other.metrics
+    slips = f"{shown(metrics.min_slip, 3)} … {shown(metrics.max_slip, 3)}"
     return [
-        Tile("Energy", shown(row["wh_per_km"], 2), "Wh/km", f"{name}: {shown(other['wh_per_km'], 2)}"),
-        Tile("Saving", shown(row["saving_percent"], 2), "%", f"against {name}"),
-        Tile("ΔSoC", shown(row["delta_soc_percent"], 3), "%", f"{name}: {shown(other['delta_soc_percent'], 3)}"),
-        Tile("Distance", shown(row["distance_km"], 3), "km", f"{name}: {shown(other['distance_km'], 3)}"),
-        Tile("Slip", f"{shown(row['min_slip'], 3)} … {shown(row['max_slip'], 3)}", "", "both axles, above 1 m/s"),
-        Tile("Front share", shown(row["share_changes_per_min"], 1), "/ min", "changes by more than 0.25"),
+        Tile("Energy", shown(metrics.wh_per_km, 2), "Wh/km", f"{name}: {shown(beside.wh_per_km, 2)}"),
+        Tile("Saving", shown(row.saving_percent, 2), "%", f"against {name}"),
+        Tile("ΔSoC", shown(metrics.delta_soc_percent, 3), "%", f"{name}: {shown(beside.delta_soc_percent, 3)}"),
+        Tile(
+            "Distance", shown(metrics.distance_m / 1000.0, 3), "km", f"{name}: {shown(beside.distance_m / 1000.0, 3)}"
+        ),
+        Tile("Slip", slips, "", "both axles, above 1 m/s"),
+        Tile("Front share", shown(row.share_changes_per_min, 1), "/ min", "changes by more than 0.25"),
     ]
 
 

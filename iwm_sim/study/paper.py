@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import statistics
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
@@ -29,37 +30,47 @@ def cell(cycle: str, friction: float) -> dict[str, float]:
     return result
 
 
-def consequences(
-    pack_energy_wh: float, distance_m: dict[str, float], mean_speed_mps: dict[str, float]
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Consequences:
     """What the printed numbers imply.
 
-    Parameters
+    Attributes
     ----------
-    pack_energy_wh : of the car of Table 1
-    distance_m, mean_speed_mps : of each cycle
-
-    Returns
-    -------
-    `wh_per_km` and `mean_power_w` by cycle (ED, friction 0.9), `savings` with mean and median, whether the savings are
-    what the ΔSoC say (to the digits printed), where GRDP beats ED
+    wh_per_km, mean_power_w : of ED at friction 0.9, by cycle
+    mean_saving_percent, median_saving_percent : of all cells; one mean is without NYCC at friction 0.2
+    largest_misprint_percent : largest difference of a printed saving from the one its ΔSoC give, points
+    grdp_beats_ed, cells : number of cells in which the rule is better than equal split, and of all
     """
+
+    wh_per_km: dict[str, float]
+    mean_power_w: dict[str, float]
+    mean_saving_percent: float
+    mean_saving_without_nycc_on_ice_percent: float
+    median_saving_percent: float
+    largest_misprint_percent: float
+    grdp_beats_ed: int
+    cells: int
+    table_6_repeats_table_3: bool
+
+
+def consequences(pack_energy_wh: float, distance_m: dict[str, float], mean_speed_mps: dict[str, float]) -> Consequences:
+    """What the printed numbers imply for a pack of this energy; distance and mean speed are those of each cycle."""
     cells = {(cycle, friction): cell(cycle, friction) for friction in FRICTIONS for cycle in CYCLES}
     savings = [values["saving"] for values in cells.values()]
     usual = [values["saving"] for key, values in cells.items() if key != ("nycc", 0.2)]
     wh_per_km = {c: cell(c, 0.9)["ED"] / 100.0 * pack_energy_wh / (distance_m[c] / 1000.0) for c in CYCLES}
-    return {
-        "wh_per_km": wh_per_km,
-        "mean_power_w": {c: wh_per_km[c] * 3.6 * mean_speed_mps[c] for c in CYCLES},
-        "mean_saving_percent": statistics.fmean(savings),
-        "mean_saving_without_nycc_on_ice_percent": statistics.fmean(usual),
-        "median_saving_percent": statistics.median(savings),
-        "largest_misprint_percent": max(
+    return Consequences(
+        wh_per_km=wh_per_km,
+        mean_power_w={c: wh_per_km[c] * 3.6 * mean_speed_mps[c] for c in CYCLES},
+        mean_saving_percent=statistics.fmean(savings),
+        mean_saving_without_nycc_on_ice_percent=statistics.fmean(usual),
+        median_saving_percent=statistics.median(savings),
+        largest_misprint_percent=max(
             abs(100.0 * (1.0 - values["SDP"] / values["ED"]) - values["saving"]) for values in cells.values()
         ),
-        "grdp_beats_ed": sum(values["GRDP"] < values["ED"] for values in cells.values()),
-        "cells": len(cells),
-        "table_6_repeats_table_3": all(
+        grdp_beats_ed=sum(values["GRDP"] < values["ED"] for values in cells.values()),
+        cells=len(cells),
+        table_6_repeats_table_3=all(
             printed()["table_6"][c]["with_skid_avoidance"] == cell(c, 0.9)["saving"] for c in CYCLES
         ),
-    }
+    )

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from iwm_power_manager import jit
-from iwm_power_manager.errors import IwmError, PolicyError
+from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.errors import PolicyError
 from iwm_power_manager.files import read_bytes
+from iwm_power_manager.mdp.demand import chain_of, source_of
+from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import Policy, choose, load_policy
 from iwm_power_manager.share import resolve
-from iwm_power_manager.tools import solve_policy
+from iwm_power_manager.solve import grid_path, solve_one
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.study.cases import policy_of
 
@@ -118,21 +119,10 @@ def solved(
         what = f"solving the policy on grid {grid_file.stem} for friction {friction:g}, idle_drive {vehicle.idle_drive}"
         say(f"{because}; {what}" if because else what)
         folder.mkdir(parents=True, exist_ok=True)
-        arguments = ["--vehicle", str(vehicle.path), "--idle-drive", vehicle.idle_drive, "--friction", repr(friction)]
-        for cycle in cycles:
-            arguments += ["--cycle", str(resolve(cycle))]
-        complaints = io.StringIO()
-        with contextlib.redirect_stderr(complaints):
-            code = solve_policy.main([*arguments, "--grid", str(grid_file), "--output", str(file), "--quiet"])
-        if code not in (solve_policy.SOLVED, solve_policy.UNSOLVED):
-            raise IwmError(complaints.getvalue().strip().removeprefix("solve_policy: error: "))
+        problem = load_problem(grid_file)
+        sources = [source_of(load_cycle(resolve(cycle)), problem, vehicle.params) for cycle in cycles]
+        solve_one(problem, vehicle, friction, chain_of(problem, sources), sources, file)
     return str(file)
-
-
-def grid_path(grid: str) -> Path:
-    """File of a grid: a preset by name, or the file itself."""
-    preset = resolve(f"config/grids/{grid}.yaml")
-    return preset if preset.exists() else resolve(grid)
 
 
 def _is_whole(file: Path) -> bool:

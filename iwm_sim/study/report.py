@@ -1,26 +1,28 @@
 """One self-contained HTML page: tables, charts over time, figures and settings of a run.
 
-A page is a list of blocks, each a small frozen dataclass that knows its own HTML. The page makes no request of any
-kind: style, script and data stand in the file, and its content security policy forbids the browser to fetch anything.
-Charts over time are drawn in the browser from data thinned here (`thin`), so that a finger or a mouse can read values
-and zoom; figures are matplotlib SVG whose colours follow the page from light to dark.
+A page is a list of blocks, each a small frozen dataclass; `assets/report.html.jinja` knows how each looks, and escapes
+whatever it is given. The page makes no request of any kind: style, script and data stand in the file, and its content
+security policy forbids the browser to fetch anything. Charts over time are drawn in the browser from data thinned here
+(`thin`), so that a finger or a mouse can read values and zoom; figures are matplotlib SVG whose colours follow the page
+from light to dark.
 """
 
 from __future__ import annotations
 
+import functools
 import html
 import io
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
@@ -32,11 +34,11 @@ from iwm_sim.study.palette import COLOURS, INK
 CHART_POINTS = 6000
 
 
-class Block(Protocol):
-    """A part of a page."""
+class Verdict(NamedTuple):
+    """Good or bad, in a word: never by colour alone."""
 
-    def to_html(self, number: int) -> str:
-        """HTML of the block; `number` is unique on its page."""
+    good: bool
+    word: str
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,6 @@ class Text:
 
     text: str
     title: str = ""
-
-    def to_html(self, number: int) -> str:
-        """HTML of the block; `number` is unique on its page."""
-        return f"{_heading(self.title)}<p>{_escape(self.text)}</p>"
 
 
 @dataclass(frozen=True)
@@ -66,86 +64,68 @@ class Tiles:
     """The key figures of a run, side by side."""
 
     tiles: Sequence[Tile]
-
-    def to_html(self, number: int) -> str:
-        """HTML of the block; `number` is unique on its page."""
-        cells = "".join(
-            f'<div class="tile"><div class="name">{_escape(tile.name)}</div>'
-            f'<div class="value">{_escape(tile.value)} <span class="unit">{_escape(tile.unit)}</span></div>'
-            f'<div class="detail">{_escape(tile.detail)}</div></div>'
-            for tile in self.tiles
-        )
-        return f'<div class="tiles">{cells}</div>'
+    title: str = ""
 
 
 @dataclass(frozen=True)
-class Column:
+class Column[R]:
     """A column of a table.
 
     Attributes
     ----------
-    key : key of its values in the rows
     label, unit : heading
+    value : what a row has there: a number, a text, a `Verdict`, or None
     decimals : digits after the point of its numbers; None shows the values as text
+    group : heading above neighbouring columns that share it
     best : "low" or "high" prints the best value of the valid rows bold; "" none
     """
 
-    key: str
     label: str
+    value: Callable[[R], Any]
     unit: str = ""
     decimals: int | None = None
+    group: str = ""
     best: str = ""
+
+    def shown(self, row: R) -> str:
+        """Text of a row's value."""
+        return format_value(self.value(row), self.decimals)
+
+    @property
+    def name(self) -> str:
+        """Heading in one line, without the unit."""
+        return f"{self.group} {self.label}".strip()
 
 
 @dataclass(frozen=True)
-class Table:
-    """Rows (mappings, as read from JSON) under columns. A row whose `valid_key` is false is marked and greyed."""
+class Table[R]:
+    """Rows under columns; one that is not `valid` is greyed and never the best."""
 
     title: str
-    columns: Sequence[Column]
-    rows: Sequence[Mapping[str, Any]]
+    columns: Sequence[Column[R]]
+    rows: Sequence[R]
     note: str = ""
-    valid_key: str = "trace_held"
+    valid: Callable[[R], bool] = lambda _: True
 
-    def to_html(self, number: int) -> str:
-        """HTML of the block; `number` is unique on its page."""
-        best = {column.key: self._best(column) for column in self.columns}
-        head = "".join(
-            f"<th{_text_class(column)}>{_escape(column.label)}"
-            + (f'<span class="unit">{_escape(column.unit)}</span>' if column.unit else "")
-            + "</th>"
-            for column in self.columns
-        )
-        body = "".join(self._row(row, best) for row in self.rows)
-        return (
-            f"{_heading(self.title)}<div class=scroll><table><thead><tr>{head}</tr></thead>"
-            f"<tbody>{body}</tbody></table></div>{_note(self.note)}"
-        )
+    def is_best(self, column: Column[R], row: R) -> bool:
+        """Whether a row's value is the best of a column that has one."""
+        if not column.best or not self.valid(row):
+            return False
+        values = [value for other in self.rows if self.valid(other) and _is_number(value := column.value(other))]
+        if len(values) < 2 or min(values) == max(values):
+            return False
+        return bool(column.value(row) == (min(values) if column.best == "low" else max(values)))
 
-    def _best(self, column: Column) -> float | None:
-        values = [row[column.key] for row in self.rows if self._valid(row) and _is_number(row.get(column.key))]
-        if not column.best or len(values) < 2 or min(values) == max(values):
-            return None
-        return float(min(values) if column.best == "low" else max(values))
-
-    def _valid(self, row: Mapping[str, Any]) -> bool:
-        return bool(row.get(self.valid_key, True))
-
-    def _row(self, row: Mapping[str, Any], best: Mapping[str, float | None]) -> str:
-        cells = []
-        for index, column in enumerate(self.columns):
-            value = row.get(column.key)
-            if column.key == self.valid_key and isinstance(value, bool | np.bool_):
-                shown = badge(bool(value), "held", "lost")
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """Headings above the columns with the number of columns each spans; empty without any."""
+        spans: list[tuple[str, int]] = []
+        for column in self.columns:
+            if column.group and spans and spans[-1][0] == column.group:
+                spans[-1] = (column.group, spans[-1][1] + 1)
             else:
-                shown = _escape(format_value(value, column.decimals))
-            tag = "th" if index == 0 else "td"
-            is_best = _is_number(value) and best[column.key] is not None and value == best[column.key]
-            classes = " ".join(
-                name for name, on in (("text", column.decimals is None), ("best", is_best and self._valid(row))) if on
-            )
-            cells.append(f'<{tag} class="{classes}">{shown}</{tag}>' if classes else f"<{tag}>{shown}</{tag}>")
-        return f"<tr{'' if self._valid(row) else ' class=invalid'}>{''.join(cells)}</tr>"
+                spans.append((column.group, 1))
+        return spans if any(name for name, _ in spans) else []
 
 
 @dataclass(frozen=True)
@@ -195,10 +175,11 @@ class Chart:
     panels: Sequence[Panel]
     note: str = ""
 
-    def to_html(self, number: int) -> str:
-        """HTML of the block; `number` is unique on its page."""
+    def data(self) -> str:
+        """What the page's script draws, as JSON that may stand inside a script element."""
+        if not any(panel.series for panel in self.panels):
+            raise ValueError(f"chart {self.title!r} has no series")
         time = np.asarray(self.time_s, dtype=np.float64)
-        thin_time: NDArray[np.float64] | None = None
         panels = []
         for panel in self.panels:
             lines = []
@@ -225,13 +206,8 @@ class Chart:
                     "series": lines,
                 }
             )
-        if thin_time is None:
-            raise ValueError(f"chart {self.title!r} has no series")
-        data = json.dumps({"time": _compact(thin_time, 8), "panels": panels}, separators=(",", ":"), allow_nan=False)
-        return (
-            f'{_heading(self.title)}<div class="chart" id="chart-{number}">'
-            f'<script type="application/json">{data.replace("<", "\\u003c")}</script></div>{_note(self.note)}'
-        )
+        content = {"time": _compact(thin_time, 8), "panels": panels}
+        return json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 
 
 @dataclass(frozen=True)
@@ -251,15 +227,6 @@ class Pictures:
     pictures: Sequence[Picture]
     note: str = ""
 
-    def to_html(self, number: int) -> str:
-        """HTML of the block; `number` is unique on its page."""
-        figures = "".join(
-            f"<figure>{svg_of(picture.figure, f'f{number}-{index}', picture.title)}"
-            f"<figcaption><b>{_escape(picture.title)}</b> {_escape(picture.note)}</figcaption></figure>"
-            for index, picture in enumerate(self.pictures)
-        )
-        return f'{_heading(self.title)}{_note(self.note)}<div class="pictures">{figures}</div>'
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -268,13 +235,8 @@ class Settings:
     title: str
     items: Mapping[str, Any]
 
-    def to_html(self, number: int) -> str:
-        """HTML of the block; `number` is unique on its page."""
-        entries = "".join(
-            f"<div><dt>{_escape(name)}</dt><dd>{_escape(format_value(value, None))}</dd></div>"
-            for name, value in self.items.items()
-        )
-        return f'{_heading(self.title)}<dl class="settings">{entries}</dl>'
+
+Block = Text | Tiles | Table[Any] | Chart | Pictures | Settings
 
 
 @dataclass(frozen=True)
@@ -295,35 +257,35 @@ class Page:
     verdict: str = ""
 
 
+@functools.cache
+def _environment() -> Environment:
+    """Templates of this package; whatever is put into them is escaped."""
+    made = Environment(
+        loader=PackageLoader("iwm_sim.study", "assets"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= {"shown": format_value, "kind": lambda block: type(block).__name__.lower(), "anchor": anchor}
+    made.globals |= {"version": __version__, "svg": svg_of}
+    made.tests["verdict"] = lambda value: isinstance(value, Verdict)
+    return made
+
+
 def render(page: Page) -> str:
     """The page as one HTML document."""
-    assets = files("iwm_sim.study") / "assets"
-    style = (assets / "report.css").read_text("utf-8")
-    script = (assets / "report.js").read_text("utf-8")
-    verdict = "" if page.valid is None else f"<p>{badge(page.valid, 'valid', 'not valid')} {_escape(page.verdict)}</p>"
-    body = "\n".join(block.to_html(number) for number, block in enumerate(page.blocks))
-    return (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; "
-        "script-src 'unsafe-inline'; img-src data:\">"
-        f'<title>{_escape(page.title)}</title><link rel="icon" href="data:,">\n<style>\n{style}</style></head>\n'
-        f'<body><header><h1>{_escape(page.title)}</h1><p class="lead">{_escape(page.lead)}</p>{verdict}</header>\n'
-        f"<main>{body}</main>\n<noscript><p>The charts over time need JavaScript; tables and figures do not.</p>"
-        f"</noscript>\n<footer>iwm_power_manager {_escape(__version__)}</footer>\n"
-        f"<script>\n{script}</script></body></html>\n"
-    )
+    return _environment().get_template("report.html.jinja").render(page=page).strip() + "\n"
+
+
+def anchor(title: str) -> str:
+    """Id of a heading."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def write_page(path: Path | str, page: Page) -> None:
     """Write the page atomically; `ConfigError` if the folder cannot be written."""
     atomic_write(path, render(page).encode())
-
-
-def badge(good: bool, yes: str, no: str) -> str:
-    """A marked word: never by colour alone."""
-    kind, mark, word = ("good", "✓", yes) if good else ("bad", "✗", no)
-    return f'<span class="badge {kind}">{mark} {_escape(word)}</span>'
 
 
 def format_value(value: Any, decimals: int | None) -> str:
@@ -332,6 +294,8 @@ def format_value(value: Any, decimals: int | None) -> str:
         return "–"
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
+    if isinstance(value, Verdict):
+        return value.word
     if not _is_number(value):
         return str(value)
     text = f"{value:.{decimals}f}" if decimals is not None else f"{value:g}" if isinstance(value, float) else str(value)
@@ -401,7 +365,7 @@ def svg_of(figure: Figure, prefix: str, title: str) -> str:
     # Width and height in points would fix the size; the view box alone lets the page decide.
     text = re.sub(r'<svg([^>]*?)\swidth="[^"]*"', r"<svg\1", text, count=1)
     text = re.sub(r'<svg([^>]*?)\sheight="[^"]*"', r"<svg\1", text, count=1)
-    return text.replace("<svg", f'<svg role="img" aria-label="{_escape(title)}"', 1)
+    return text.replace("<svg", f'<svg role="img" aria-label="{html.escape(title)}"', 1)
 
 
 def _page_font(font: str) -> str:
@@ -421,21 +385,5 @@ def _compact(values: NDArray[np.float64], digits: int = 7) -> list[float | int |
     return numbers
 
 
-def _heading(title: str) -> str:
-    return f"<h2>{_escape(title)}</h2>" if title else ""
-
-
-def _note(text: str) -> str:
-    return f'<p class="note">{_escape(text)}</p>' if text else ""
-
-
-def _text_class(column: Column) -> str:
-    return ' class="text"' if column.decimals is None else ""
-
-
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool | np.bool_)
-
-
-def _escape(text: str) -> str:
-    return html.escape(text, quote=True)

@@ -1,6 +1,6 @@
 """All tables and figures of the paper, and what beats them: drives everything and gathers the numbers.
 
-The result is plain values (`study.json`), from which `pages` makes tables, and a few series for the figures.
+The result is a `Study` (stored as `study.json`), from which `pages` makes tables, and a few series for the figures.
 """
 
 from __future__ import annotations
@@ -25,14 +25,16 @@ from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
 from iwm_power_manager.policy import Policy
 from iwm_power_manager.vehicle import Vehicle, pack_energy_wh
-from iwm_sim.study import battery_fit, cases, criteria, pages, paper, sensitivity, skid
+from iwm_sim.study import battery_fit, cases, criteria, labels, pages, paper, sensitivity, skid
 from iwm_sim.study.cases import Case, Change, Result, Rule, SensorNoise
+from iwm_sim.study.content import Frontier, FrontierPoint, PolicyIdentity, Robustness, Study
 from iwm_sim.study.driving import on_all_cores, warm_up
 from iwm_sim.study.policies import PolicySource, solved
+from iwm_sim.study.rows import Row, rows_of
+from iwm_sim.study.study_figures import Material, drawn
 
 FloatArray = npt.NDArray[np.float64]
 
-FORMAT = 1
 IDLE_DRIVES = ("none", "drag")
 #: The strategy that plays our policy.
 STRATEGY = "sdp_lookahead"
@@ -67,24 +69,6 @@ HUB_MOTOR = (
     Change("motor", "loss_quadratic_torque", 0.045),
 )
 
-#: What stands in a row of the study's JSON; what is the same for all rows stands there once.
-_KEPT = (
-    *("cycle", "friction", "idle_drive", "label", "strategy", "delta_soc_percent", "wh_per_km", "distance_m"),
-    *("saving_percent", "share_of_possible", "same_distance_as_equal", "rms_speed_error_mps", "max_speed_error_mps"),
-    *("trace_held", "trace_excess_mps", "min_slip", "max_slip", "locked_s", "longest_locked_s"),
-    *("share_changes_per_min", "share_travel_per_min", "rms_jerk_mps3", "max_torque_rate_nmps"),
-)
-
-
-class Material(NamedTuple):
-    """What the figures need beyond the study's JSON."""
-
-    battery: battery_fit.Fit
-    rule: Rule
-    convergence: tuple[FloatArray, FloatArray]
-    window: dict[str, dict[str, FloatArray]]
-    chain: tuple[FloatArray, FloatArray]
-
 
 class _Plan(NamedTuple):
     """Cases by the part of the study they are for."""
@@ -104,7 +88,7 @@ def study(
     quiet: bool,
     document: Path | None = None,
     cycles: Sequence[str] = paper.CYCLES,
-) -> dict[str, Any]:
+) -> Study:
     """Make the whole study and write it into a folder: `study.json`, `study.html`, `study.md`, `figures/`.
 
     Parameters
@@ -143,7 +127,8 @@ def study(
         bar.refresh()
         made = on_all_cores(_call, tasks, jobs, lambda _: _tick(bar))
     results: list[Result] = made[: len(_all(plan))]
-    content = _content(vehicle, plan, results, made[-2], made[-1], ours, paper_policies)
+    stored = _study(vehicle, plan, results, made[-2], made[-1], ours, paper_policies).to_json()
+    content = Study.from_json(stored)  # its numbers are those that a reader of the file has
     key = (IDLE_DRIVES[0], paper.FRICTIONS[0])
     convergence = cases.policy_of(paper_policies[PAPER_GRID][key])
     material = Material(
@@ -153,8 +138,7 @@ def study(
         window=_window(results),
         chain=(convergence.chain.probability, convergence.chain.power_w),
     )
-    pages.write(output, content, pages.drawn(content, material, _car(vehicle, IDLE_DRIVES[0]).params))
-    stored = (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()
+    pages.write(output, content, drawn(content.frontier, material, _car(vehicle, IDLE_DRIVES[0]).params))
     atomic_write(output / "study.json", stored)
     if document:
         pages.update_document(document, content)
@@ -271,32 +255,32 @@ def _cell(base: Case, policy: str, paper_policy: str, rule: tuple[float, ...], k
         replace(
             base,
             strategy="instantaneous_slip",
-            label=f"{criteria.INSTANTANEOUS_SLIP} {power:g} W",
+            label=f"{labels.INSTANTANEOUS_SLIP} {power:g} W",
             settings=settings._replace(switching_power_w=power),
         )
         for power in RIVAL_SWITCHING_W
     ]
     return [
-        replace(base, label=criteria.ED, keep=keep),
-        replace(base, strategy="rule", label=criteria.GRDP, rule=rule),
+        replace(base, label=labels.ED, keep=keep),
+        replace(base, strategy="rule", label=labels.GRDP, rule=rule),
         replace(
             base,
             strategy="sdp",
-            label=pages.PAPER_SDP,
+            label=labels.PAPER_SDP,
             policy=paper_policy,
             settings=settings._replace(decision_period_s=PAPER_PERIOD_S),
         ),
-        replace(base, strategy=STRATEGY, label=criteria.OURS, policy=policy, keep=keep),
-        replace(base, strategy="instantaneous", label=criteria.INSTANTANEOUS),
+        replace(base, strategy=STRATEGY, label=labels.OURS, policy=policy, keep=keep),
+        replace(base, strategy="instantaneous", label=labels.INSTANTANEOUS),
         *rivals,
         replace(
             base,
             strategy="preview",
-            label=criteria.BOUND,
+            label=labels.BOUND,
             switching_cost_j=problem.switching_cost_j,
             switching_fixed_cost_j=problem.switching_fixed_cost_j,
         ),
-        replace(base, strategy="preview", label=pages.FREE_BOUND),
+        replace(base, strategy="preview", label=labels.FREE_BOUND),
     ]
 
 
@@ -307,7 +291,7 @@ def _gates(base: Case, paper_policy: str, without: str, keep: tuple[str, ...]) -
         replace(
             base,
             strategy="sdp",
-            label=pages.GATE_OFF,
+            label=labels.GATE_OFF,
             policy=without,
             settings=settings._replace(gate_mode=GATE_MODES["off"]),
             keep=keep,
@@ -315,7 +299,7 @@ def _gates(base: Case, paper_policy: str, without: str, keep: tuple[str, ...]) -
         replace(
             base,
             strategy="sdp",
-            label=pages.GATE_TABLE_2,
+            label=labels.GATE_TABLE_2,
             policy=paper_policy,
             settings=settings._replace(gate_mode=GATE_MODES["table2"], gate_hysteresis=0.0, gate_driving=False),
             keep=keep,
@@ -365,8 +349,8 @@ def _robustness(base: Case, ours: Mapping[tuple[str, float], str]) -> list[tuple
     made = []
     for name, case in variants.items():
         policy = ours[base.idle_drive, case.told_friction]
-        made.append((name, replace(case, label=criteria.ED)))
-        made.append((name, replace(case, strategy=STRATEGY, label=criteria.OURS, policy=policy)))
+        made.append((name, replace(case, label=labels.ED)))
+        made.append((name, replace(case, strategy=STRATEGY, label=labels.OURS, policy=policy)))
     return made
 
 
@@ -379,125 +363,95 @@ def _stops(vehicle: str, ours: Mapping[tuple[str, float], str]) -> list[skid.Sto
     ]
 
 
-def _all_stops(stops: Sequence[skid.Stop]) -> list[dict[str, Any]]:
+def _all_stops(stops: Sequence[skid.Stop]) -> list[skid.Stopped]:
     return [skid.emergency_stop(stop) for stop in stops]
 
 
 # --- what came of it ------------------------------------------------------------------------------------------------
 
 
-def _content(
+def _study(
     vehicle: str,
     plan: _Plan,
     results: Sequence[Result],
     battery: battery_fit.Fit,
-    stops: Sequence[Mapping[str, Any]],
+    stops: list[skid.Stopped],
     ours: Mapping[tuple[str, float], str],
     paper_policies: Mapping[str, Mapping[tuple[str, float], str]],
-) -> dict[str, Any]:
+) -> Study:
     tables = len(plan.cells) + len(plan.gates)
-    cell_rows = [compact(row) for row in cases.rows(results[:tables])]
+    cell_rows = rows_of(results[:tables])
     rows, gate_rows = cell_rows[: len(plan.cells)], cell_rows[len(plan.cells) :]
-    frontier = _frontier_rows(results[tables : tables + len(plan.frontier)])
-    robustness = _robustness_rows([name for name, _ in plan.robustness], results[tables + len(plan.frontier) :])
     car = _car(vehicle, IDLE_DRIVES[0])
     driven = {cases.cycle_of(case.cycle).name: cases.cycle_of(case.cycle) for case in plan.cells}
     printed = [cases.cycle_of(name) for name in paper.CYCLES]
     settings = default_settings(STRATEGY)
-    checks = criteria.check(rows, stops, settings.slew_down_nmps)
-    return _rounded(
-        {
-            "format": FORMAT,
-            "package_version": __version__,
-            "vehicle": car.name,
-            "vehicle_hashes": {idle_drive: _car(vehicle, idle_drive).hash for idle_drive in IDLE_DRIVES},
-            "cycles": {name: cycle.sha256 for name, cycle in driven.items()},
-            "strategy": STRATEGY,
-            "settings": settings._asdict(),
-            "policies": {
-                "ours": [_identity(key, path) for key, path in ours.items()],
-                **{grid: [_identity(key, path) for key, path in made.items()] for grid, made in paper_policies.items()},
-            },
-            "cells": rows,
-            "gates": gate_rows,
-            "stops": list(stops),
-            "frontier": {
-                "cycle": cases.cycle_of(plan.frontier[0].cycle).name,
-                "friction": plan.frontier[0].friction,
-                "rows": frontier,
-            },
-            "robustness": robustness,
-            "battery_fit": battery.numbers(),
-            "sensitivity": _sensitivity(vehicle),
-            "paper": paper.consequences(
-                pack_energy_wh(car.params.battery),
-                {cycle.name: cycle.distance_m for cycle in printed},
-                {cycle.name: cycle.distance_m / cycle.duration_s for cycle in printed},
-            ),
-            "criteria": [criterion._asdict() for criterion in checks],
-        }
+    return Study(
+        package_version=__version__,
+        vehicle=car.name,
+        vehicle_hashes={idle_drive: _car(vehicle, idle_drive).hash for idle_drive in IDLE_DRIVES},
+        cycles={name: cycle.sha256 for name, cycle in driven.items()},
+        strategy=STRATEGY,
+        settings=settings._asdict(),
+        policies={
+            "ours": [_identity(key, path) for key, path in ours.items()],
+            **{grid: [_identity(key, path) for key, path in made.items()] for grid, made in paper_policies.items()},
+        },
+        cells=rows,
+        gates=gate_rows,
+        stops=stops,
+        frontier=_frontier_of(plan.frontier[0], results[tables : tables + len(plan.frontier)]),
+        robustness=_robustness_rows([name for name, _ in plan.robustness], results[tables + len(plan.frontier) :]),
+        battery_fit=battery.estimates(),
+        sensitivity=_sensitivity(vehicle),
+        paper=paper.consequences(
+            pack_energy_wh(car.params.battery),
+            {cycle.name: cycle.distance_m for cycle in printed},
+            {cycle.name: cycle.distance_m / cycle.duration_s for cycle in printed},
+        ),
+        criteria=criteria.check(rows, stops, settings.slew_down_nmps),
     )
 
 
-def compact(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A row without what is the same for all rows."""
-    return {name: row[name] for name in _KEPT}
-
-
-def _rounded(value: Any) -> Any:
-    """Plain values with six significant digits: enough for any table, and stable under the last bits."""
-    if isinstance(value, Mapping):
-        return {str(key): _rounded(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_rounded(entry) for entry in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, float | np.floating):
-        return float(f"{value:.6g}") if np.isfinite(value) else None
-    return value
-
-
-def _identity(key: tuple[str, float], path: str) -> dict[str, Any]:
+def _identity(key: tuple[str, float], path: str) -> PolicyIdentity:
     policy: Policy = cases.policy_of(path)
-    return {
-        "idle_drive": key[0],
-        "friction": key[1],
-        "solved_for_friction": policy.friction,
-        "grid": policy.problem.name,
-        "checksum": policy.checksum,
-        "switching_cost_j": policy.problem.switching_cost_j,
-        "switching_fixed_cost_j": policy.problem.switching_fixed_cost_j,
-    }
+    return PolicyIdentity(
+        idle_drive=key[0],
+        friction=key[1],
+        solved_for_friction=policy.friction,
+        grid=policy.problem.name,
+        checksum=policy.checksum,
+        switching_cost_j=policy.problem.switching_cost_j,
+        switching_fixed_cost_j=policy.problem.switching_fixed_cost_j,
+    )
 
 
-def _frontier_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
-    rows = []
-    for row in cases.rows(results):
-        family, price = row["label"].split("|")
-        rows.append(
-            {
-                "family": family,
-                "price": price,
-                "saving_percent": row["saving_percent"],
-                "share_changes_per_min": row["share_changes_per_min"],
-            }
+def _frontier_of(base: Case, results: Sequence[Result]) -> Frontier:
+    points = []
+    for row in rows_of(results):
+        family, price = row.label.split("|")
+        points.append(FrontierPoint(family, price, row.saving_percent, row.metrics.share_changes_per_min))
+    return Frontier(cases.cycle_of(base.cycle).name, base.friction, points)
+
+
+def _robustness_rows(names: Sequence[str], results: Sequence[Result]) -> list[Robustness]:
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for name, row in zip(names, rows_of(results), strict=True):
+        if row.label == labels.OURS:
+            groups.setdefault((name, row.place.idle_drive), []).append(row)
+    return [
+        Robustness(
+            variant=name,
+            idle_drive=idle_drive,
+            saving_percent={row.place.cycle: row.saving_percent for row in rows},
+            trace_held=all(row.metrics.trace_held for row in rows),
+            share_changes_per_min=max(row.metrics.share_changes_per_min for row in rows),
         )
-    return rows
+        for (name, idle_drive), rows in groups.items()
+    ]
 
 
-def _robustness_rows(names: Sequence[str], results: Sequence[Result]) -> list[dict[str, Any]]:
-    rows: dict[tuple[str, str], dict[str, Any]] = {}
-    for name, row in zip(names, cases.rows(results), strict=True):
-        if row["label"] != criteria.OURS:
-            continue
-        entry = rows.setdefault((name, row["idle_drive"]), {"variant": name, "idle_drive": row["idle_drive"]})
-        entry[row["cycle"]] = row["saving_percent"]
-        entry["trace_held"] = entry.get("trace_held", True) and row["trace_held"]
-        entry["share_changes_per_min"] = max(entry.get("share_changes_per_min", 0.0), row["share_changes_per_min"])
-    return list(rows.values())
-
-
-def _sensitivity(vehicle: str) -> dict[str, Any]:
+def _sensitivity(vehicle: str) -> dict[str, dict[str, float]]:
     params = _car(vehicle, IDLE_DRIVES[0]).params
     curves = {
         "figure_8": sensitivity.figure_8(params),

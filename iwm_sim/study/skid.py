@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,33 @@ class Stop(NamedTuple):
     from_mps: float = STOP_FROM_MPS
 
 
+@dataclass(frozen=True)
+class Stopped:
+    """What came of an emergency stop.
+
+    Attributes
+    ----------
+    distance_m, best_m : how far it slid, and the shortest stop with all wheels at one slip, `best_slip`
+    longer_percent : than the best
+    locked_s, longest_locked_s : an axle beyond the critical slip, in all and at a stretch
+    """
+
+    idle_drive: str
+    friction: float
+    gate_mode: str
+    strategy: str
+    strategy_code: int
+    distance_m: float
+    best_m: float
+    best_slip: float
+    longer_percent: float
+    stopped: bool
+    min_slip: float
+    locked_s: float
+    longest_locked_s: float
+    rms_jerk_mps3: float
+
+
 def best_stop_m(friction: float, from_mps: float, vehicle: VehicleParams) -> tuple[float, float]:
     """Shortest stop with all wheels held at one slip, and that slip.
 
@@ -59,8 +87,8 @@ def best_stop_m(friction: float, from_mps: float, vehicle: VehicleParams) -> tup
     return float(distance[best]), float(slip[best])
 
 
-def emergency_stop(stop: Stop) -> dict[str, Any]:
-    """Make the stop and say what came of it, as a row."""
+def emergency_stop(stop: Stop) -> Stopped:
+    """Make the stop and say what came of it."""
     vehicle = cases.vehicle_of(stop.vehicle, stop.idle_drive)
     params = vehicle.params
     settings = default_settings(stop.strategy)._replace(gate_mode=GATE_MODES[stop.gate_mode])
@@ -68,45 +96,48 @@ def emergency_stop(stop: Stop) -> dict[str, Any]:
         settings = settings._replace(gate_hysteresis=0.0, gate_driving=False)  # as printed
     table = cases.policy_of(stop.policy).table() if stop.policy else empty_table()
     road = (stop.friction,) * 4
-    rolling = params.front.wheel.radius_m
     car = plant.initial_plant(params, 0.8, stop.from_mps)
     memory = initial_state()
-    slips, speeds, accelerations = [], [], []
-    steps = 0
-    while car.speed_mps > _STOPPED_MPS and steps * stop.dt_s < _LONGEST_S:
+    slips: list[list[float]] = []
+    speeds: list[float] = []
+    accelerations: list[float] = []
+    while car.speed_mps > _STOPPED_MPS and len(speeds) * stop.dt_s < _LONGEST_S:
         floor = params.driver.power_speed_floor_mps
         demand = -DEMAND_G * params.chassis.mass_kg * GRAVITY_MPS2 * max(car.speed_mps, floor)
         measurement = closed_loop.measure(
             car, float(demand), stop.dt_s, stop.friction, 0.0, (0.0, 0.0, 0.0, 0.0), params
         )
         command, memory = law.step(measurement, memory, settings, params, table)
-        slips.append(
-            [
-                slip_ratio(car.wheel_speed_radps[wheel], car.speed_mps, rolling, params.front.tyre.slip_speed_floor_mps)
-                for wheel in (0, 2)
-            ]
-        )
+        slips.append(_axle_slips(car, params))
         speeds.append(car.speed_mps)
         car = plant.advance(car, command.motor_torque_nm, command.friction_torque_nm, 0.0, road, stop.dt_s, 1, params)
         accelerations.append(car.acceleration_mps2)
-        steps += 1
     best_m, best_slip = best_stop_m(stop.friction, stop.from_mps, params)
-    beyond = (np.min(np.array(slips), axis=1) < -CRITICAL_SLIP) & (np.array(speeds) > MOVING_MPS)
+    lowest = np.min(np.array(slips), axis=1)
     moving = np.array(speeds) > MOVING_MPS
+    beyond = (lowest < -CRITICAL_SLIP) & moving
     jerk = np.diff(np.array(accelerations)) / stop.dt_s
-    return {
-        "idle_drive": vehicle.idle_drive,
-        "friction": stop.friction,
-        "gate_mode": stop.gate_mode,
-        "strategy": stop.strategy,
-        "strategy_code": STRATEGIES[stop.strategy].code,
-        "distance_m": float(car.distance_m),
-        "best_m": best_m,
-        "best_slip": -best_slip,
-        "longer_percent": 100.0 * (float(car.distance_m) / best_m - 1.0),
-        "stopped": bool(car.speed_mps <= _STOPPED_MPS),
-        "min_slip": float(np.min(np.array(slips)[moving])) if moving.any() else 0.0,
-        "locked_s": float(np.count_nonzero(beyond) * stop.dt_s),
-        "longest_locked_s": longest_s(beyond, stop.dt_s),
-        "rms_jerk_mps3": float(math.sqrt(np.mean(jerk**2))) if jerk.size else 0.0,
-    }
+    return Stopped(
+        idle_drive=vehicle.idle_drive,
+        friction=stop.friction,
+        gate_mode=stop.gate_mode,
+        strategy=stop.strategy,
+        strategy_code=STRATEGIES[stop.strategy].code,
+        distance_m=float(car.distance_m),
+        best_m=best_m,
+        best_slip=-best_slip,
+        longer_percent=100.0 * (float(car.distance_m) / best_m - 1.0),
+        stopped=bool(car.speed_mps <= _STOPPED_MPS),
+        min_slip=float(np.min(lowest[moving])) if moving.any() else 0.0,
+        locked_s=float(np.count_nonzero(beyond) * stop.dt_s),
+        longest_locked_s=longest_s(beyond, stop.dt_s),
+        rms_jerk_mps3=float(math.sqrt(np.mean(jerk**2))) if jerk.size else 0.0,
+    )
+
+
+def _axle_slips(car: plant.PlantState, params: VehicleParams) -> list[float]:
+    """Slip of the left wheel of each axle; in a straight stop, the right one's is the same."""
+    return [
+        slip_ratio(car.wheel_speed_radps[wheel], car.speed_mps, axle.wheel.radius_m, axle.tyre.slip_speed_floor_mps)
+        for wheel, axle in ((0, params.front), (2, params.rear))
+    ]

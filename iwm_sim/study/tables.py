@@ -2,71 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-from iwm_sim.study.report import Column, format_value
+from iwm_sim.study.report import Column
+from iwm_sim.study.rows import Row
 
-Row = Mapping[str, Any]
+
+def _trace(row: Row) -> str:
+    return "held" if row.metrics.trace_held else f"lost by {row.metrics.trace_excess_mps:.2f}"
+
+
+def _saving(row: Row) -> float | str | None:
+    return "distance" if row.same_distance_as_equal is False else row.saving_percent
+
 
 #: Columns of the results of `evaluate`.
-COLUMNS = (
-    Column("label", "strategy"),
-    Column("wh_per_km", "Wh/km", "", 2),
-    Column("delta_soc_percent", "ΔSoC %", "", 3),
-    Column("saving_percent", "saving %", "", 2),
-    Column("share_of_possible", "of possible", "", 2),
-    Column("share_changes_per_min", "changes/min", "", 1),
-    Column("rms_speed_error_mps", "rms error m/s", "", 3),
-    Column("max_speed_error_mps", "max error m/s", "", 2),
-    Column("min_slip", "min slip", "", 3),
-    Column("max_slip", "max slip", "", 3),
-    Column("locked_s", "locked s", "", 2),
-    Column("trace", "trace"),
+COLUMNS: tuple[Column[Row], ...] = (
+    Column("strategy", lambda row: row.label),
+    Column("Wh/km", lambda row: row.metrics.wh_per_km, decimals=2),
+    Column("ΔSoC %", lambda row: row.metrics.delta_soc_percent, decimals=3),
+    Column("saving %", _saving, decimals=2),
+    Column("of possible", lambda row: row.share_of_possible, decimals=2),
+    Column("changes/min", lambda row: row.metrics.share_changes_per_min, decimals=1),
+    Column("rms error m/s", lambda row: row.metrics.rms_speed_error_mps, decimals=3),
+    Column("max error m/s", lambda row: row.metrics.max_speed_error_mps, decimals=2),
+    Column("min slip", lambda row: row.metrics.min_slip, decimals=3),
+    Column("max slip", lambda row: row.metrics.max_slip, decimals=3),
+    Column("locked s", lambda row: row.metrics.locked_s, decimals=2),
+    Column("trace", _trace),
 )
 
-_GROUP = ("idle_drive", "cycle", "friction")
 
-
-def text_table(rows: Sequence[Row], columns: Sequence[Column]) -> str:
+def text_table(rows: Sequence[Row], columns: Sequence[Column[Row]] = COLUMNS) -> str:
     """A plain-text table, with a heading where idle drive, cycle or friction change."""
     head = [column.label for column in columns]
-    cells = [[_cell(row, column) for column in columns] for row in rows]
+    cells = [[column.shown(row) for column in columns] for row in rows]
     widths = [max(len(line[i]) for line in [head, *cells]) for i in range(len(columns))]
     lines = []
     before = None
     for row, line in zip(rows, cells, strict=True):
-        group = tuple(row[key] for key in _GROUP)
-        if group != before:
-            before = group
-            title = f"{row['cycle']}, friction {row['friction']:g}, idle drive {row['idle_drive']}"
+        if row.place != before:
+            before = row.place
+            title = f"{before.cycle}, friction {before.friction:g}, idle drive {before.idle_drive}"
             lines += ["", title, _aligned(head, widths, columns)]
         lines.append(_aligned(line, widths, columns))
     return "\n".join(lines[1:])
 
 
-def _cell(row: Row, column: Column) -> str:
-    if column.key == "trace":
-        return "held" if row["trace_held"] else f"lost by {row['trace_excess_mps']:.2f}"
-    if column.key == "saving_percent" and row.get("same_distance_as_equal") is False:
-        return "distance"
-    return format_value(row.get(column.key), column.decimals)
-
-
-def _aligned(cells: Sequence[str], widths: Sequence[int], columns: Sequence[Column]) -> str:
+def _aligned[R](cells: Sequence[str], widths: Sequence[int], columns: Sequence[Column[R]]) -> str:
     return "  ".join(
         cell.ljust(width) if column.decimals is None else cell.rjust(width)
         for cell, width, column in zip(cells, widths, columns, strict=True)
     ).rstrip()
 
 
-def markdown_table(rows: Sequence[Row], columns: Sequence[Column], mark: Callable[[Row], str] = lambda _: "") -> str:
-    """A Markdown table; `mark` puts a sign behind a row's first cell."""
-    head = [f"{column.label}{f', {column.unit}' if column.unit else ''}" for column in columns]
+def markdown_table[R](rows: Sequence[R], columns: Sequence[Column[R]]) -> str:
+    """A Markdown table."""
+    head = [f"{column.name}{f', {column.unit}' if column.unit else ''}" for column in columns]
     lines = ["| " + " | ".join(head) + " |"]
     lines.append("|" + "|".join(" --- " if column.decimals is None else " ---: " for column in columns) + "|")
-    for row in rows:
-        cells = [format_value(row.get(column.key), column.decimals).replace("|", "\\|") for column in columns]
-        cells[0] += mark(row)
-        lines.append("| " + " | ".join(cells) + " |")
+    lines += ["| " + " | ".join(column.shown(row).replace("|", "\\|") for column in columns) + " |" for row in rows]
     return "\n".join(lines)

@@ -8,12 +8,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
@@ -23,12 +21,14 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import IDLE_DRIVES
+from iwm_power_manager.tools.options import add_setting, number, whole
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.study import battery_fit, cases, reproduce
 from iwm_sim.study.cases import POLICY_STRATEGIES, REFERENCE, Case, Result, SensorNoise
 from iwm_sim.study.driving import Progress, cores, drive_all, warm_up, with_rules
 from iwm_sim.study.policies import DEFAULT_GRID, PolicySource
-from iwm_sim.study.tables import COLUMNS, text_table
+from iwm_sim.study.rows import Row, rows_of
+from iwm_sim.study.tables import text_table
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
@@ -82,7 +82,7 @@ def parser() -> argparse.ArgumentParser:
     what.add_argument(
         "--friction",
         nargs="+",
-        type=_number(0.05, 1.5),
+        type=number(0.05, 1.5),
         default=[0.9],
         metavar="MU",
         help="peak friction coefficients of the road (default: 0.9)",
@@ -123,16 +123,16 @@ def parser() -> argparse.ArgumentParser:
 
     law = result.add_argument_group("control law")
     for name in ("gate_mode", "gate_driving", "critical_slip", "switching_power_w"):
-        _add_setting(law, name)
+        add_setting(law, name)
     law.add_argument(
         "--switching-cost",
-        type=_number(0.0, 1e6),
+        type=number(0.0, 1e6),
         metavar="J",
         help="preview: price of moving all the power to the other axle (default: that of the policy in use)",
     )
     law.add_argument(
         "--assumed-friction",
-        type=_number(0.05, 1.5),
+        type=number(0.05, 1.5),
         metavar="MU",
         help="friction the law is told (default: the road's)",
     )
@@ -140,15 +140,15 @@ def parser() -> argparse.ArgumentParser:
     run = result.add_argument_group("simulation")
     run.add_argument(
         "--dt",
-        type=_number(1e-4, cases.MAX_DT_S),
+        type=number(1e-4, cases.MAX_DT_S),
         default=0.01,
         metavar="S",
         help="control step (default: %(default)s)",
     )
-    run.add_argument("--substeps", type=_whole(1, 100), default=1, metavar="N", help="plant steps in it")
+    run.add_argument("--substeps", type=whole(1, 100), default=1, metavar="N", help="plant steps in it")
     run.add_argument(
         "--initial-soc",
-        type=_number(0.05, 1.0),
+        type=number(0.05, 1.0),
         default=0.8,
         metavar="SOC",
         help="state of charge at the start, 0..1 (default: %(default)s)",
@@ -156,15 +156,15 @@ def parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--noise",
         nargs=2,
-        type=_number(0.0, 10.0),
+        type=number(0.0, 10.0),
         default=[0.0, 0.0],
         metavar=("M/S", "RAD/S"),
         help="rms noise of speed and wheel speeds",
     )
-    run.add_argument("--seed", type=_whole(0, 2**32 - 1), default=1, metavar="N", help="of the noise")
+    run.add_argument("--seed", type=whole(0, 2**32 - 1), default=1, metavar="N", help="of the noise")
     run.add_argument(
         "--jobs",
-        type=_whole(1, 1024),
+        type=whole(1, 1024),
         default=cores(),
         metavar="N",
         help="processes (default: one for each core)",
@@ -214,51 +214,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return DONE
 
 
-def _add_setting(group: argparse._ArgumentGroup, name: str) -> None:
-    """An option for a setting of the law, made from the law's own table."""
-    known, default = law_settings.TABLE[name], getattr(law_settings.DEFAULTS, name)
-    option = "--" + name.removesuffix("_w").replace("_", "-")
-    help_text = f"{known.described()} (default: {law_settings.shown(name, default)})"
-    if isinstance(default, bool):
-        group.add_argument(option, action=argparse.BooleanOptionalAction, default=default, help=known.meaning)
-        return
-
-    def value(text: str) -> Any:
-        try:
-            return law_settings.parse(option, name, text)
-        except ConfigError as error:
-            raise argparse.ArgumentTypeError(f"{error.problem}; allowed: {error.allowed}") from None
-
-    metavar = "NAME" if known.choices else known.unit.upper() or "X"
-    group.add_argument(option, dest=name, type=value, default=default, metavar=metavar, help=help_text)
-
-
-def _number(low: float, high: float) -> Callable[[str], float]:
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"'{text}' is no number; allowed: {low:g} to {high:g}") from None
-        if not (math.isfinite(value) and low <= value <= high):
-            raise argparse.ArgumentTypeError(f"{text} is out of range; allowed: {low:g} to {high:g}")
-        return value
-
-    return number
-
-
-def _whole(low: int, high: int) -> Callable[[str], int]:
-    def whole(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"'{text}' is no integer; allowed: {low} to {high}") from None
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text} is out of range; allowed: {low} to {high}")
-        return value
-
-    return whole
-
-
 # --- cases ----------------------------------------------------------------------------------------------------------
 
 
@@ -273,14 +228,14 @@ def _evaluate(options: argparse.Namespace) -> None:
         wanted = with_rules(wanted, options.jobs)
         drive = _Saving(options.save_series) if options.save_series else cases.result
         results = drive_all(wanted, options.jobs, progress.update, drive)
-    rows = cases.rows(results)
+    rows = rows_of(results)
     if not options.quiet:
-        print(text_table(rows, COLUMNS))
+        print(text_table(rows))
         for line in remarks(rows):
             print(line)
         say(f"{len(rows)} cases in {time.perf_counter() - started:.1f} s")
     if options.json:
-        content = {"package_version": __version__, "rows": rows}
+        content = {"package_version": __version__, "rows": [row.to_json() for row in rows]}
         atomic_write(options.json, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
         say(f"rows: {options.json}")
 
@@ -345,9 +300,7 @@ def _settings(options: argparse.Namespace) -> law_settings.Settings:
     if settings.gate_mode == law_settings.GATE_MODE_TABLE2:
         settings = settings._replace(gate_hysteresis=0.0)  # as printed
     target = min(settings.slip_target, 0.75 * settings.critical_slip)  # the limiter works in front of the gate
-    settings = settings._replace(
-        slip_target=target, decision_period_s=max(settings.decision_period_s, options.dt)
-    )
+    settings = settings._replace(slip_target=target, decision_period_s=max(settings.decision_period_s, options.dt))
     problem = law_settings.check_together(settings._asdict())
     if problem:
         raise ConfigError("arguments", *problem.split(": ", 1))
@@ -366,15 +319,15 @@ class _Saving:
         return Result(case, made.metrics, {})
 
 
-def remarks(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def remarks(rows: Sequence[Row]) -> list[str]:
     """Sentences below the table, about what its marks mean."""
     lines = []
-    if not all(row["trace_held"] for row in rows):
+    if not all(row.metrics.trace_held for row in rows):
         lines.append("lost: the car left the EPA tolerance by the m/s shown; its energy says little")
-    if any(row["same_distance_as_equal"] is False for row in rows):
+    if any(row.same_distance_as_equal is False for row in rows):
         lines.append("no saving: the distance differs from that of equal split by more than 0.1 %; compare Wh/km")
-    frictions = {(row["assumed_friction"], row["policy_friction"]) for row in rows if row["policy_friction"]}
-    for told, solved_for in sorted(frictions):
+    with_policy = [row.made_with for row in rows if row.made_with["policy_friction"]]
+    for told, solved_for in sorted({(made["assumed_friction"], made["policy_friction"]) for made in with_policy}):
         if told != solved_for:
             lines.append(f"friction {told:g} was driven with the policy for {solved_for:g}, the nearest there is")
     return lines
@@ -406,7 +359,7 @@ def _fit_battery(options: argparse.Namespace) -> None:
         battery_fit.save_picture(fit, options.plot)
         _say(f"picture: {options.plot}")
     if options.json:
-        atomic_write(options.json, (json.dumps(fit.numbers(), indent=1, allow_nan=False) + "\n").encode())
+        atomic_write(options.json, (json.dumps(fit.to_json(), indent=1, allow_nan=False) + "\n").encode())
 
 
 def _say(line: str) -> None:

@@ -28,6 +28,7 @@ ROS_MODULES = {
 }  # fmt: skip
 #: Other imports, and the rosdep key that brings them.
 ROSDEP_KEYS = {
+    "jinja2": "python3-jinja2",
     "lz4": "python3-rosbags-pip",
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",

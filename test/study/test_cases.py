@@ -9,6 +9,7 @@ import pytest
 from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_sim.study import cases
 from iwm_sim.study.cases import Case, Change, SensorNoise
+from iwm_sim.study.rows import rows_of
 
 VEHICLE = "jalalmaab_2015"
 
@@ -48,18 +49,18 @@ def test_a_policy_for_another_car_is_refused(equal, small_policy):
 
 
 def test_preview_saves_what_it_schedules(equal):
-    rows = cases.rows([cases.result(equal), cases.result(dataclasses.replace(equal, strategy="preview"))])
-    assert rows[0]["saving_percent"] == 0.0
-    assert rows[1]["saving_percent"] > 0.5
-    assert rows[1]["share_of_possible"] == 1.0
+    rows = rows_of([cases.result(equal), cases.result(dataclasses.replace(equal, strategy="preview"))])
+    assert rows[0].saving_percent == 0.0
+    assert rows[1].saving_percent > 0.5
+    assert rows[1].share_of_possible == 1.0
 
 
 def test_share_of_possible_is_the_part_of_the_previews_saving(equal):
     results = [
         cases.result(dataclasses.replace(equal, strategy=name)) for name in ("equal", "preview", "instantaneous_slip")
     ]
-    _, bound, rival = cases.rows(results)
-    assert rival["share_of_possible"] == pytest.approx(rival["saving_percent"] / bound["saving_percent"])
+    _, bound, rival = rows_of(results)
+    assert rival.share_of_possible == pytest.approx(rival.saving_percent / bound.saving_percent)
 
 
 def test_energies_of_runs_over_different_distances_are_not_compared(equal):
@@ -68,21 +69,21 @@ def test_energies_of_runs_over_different_distances_are_not_compared(equal):
         case=dataclasses.replace(equal, strategy="sdp"),
         metrics=made.metrics._replace(distance_m=1.002 * made.metrics.distance_m),
     )
-    row = cases.rows([made, further])[1]
-    assert row["same_distance_as_equal"] is False
-    assert row["saving_percent"] is None
+    row = rows_of([made, further])[1]
+    assert row.same_distance_as_equal is False
+    assert row.saving_percent is None
 
 
 def test_runs_of_different_roads_are_not_compared(equal):
     icy = dataclasses.replace(equal, friction=0.2, strategy="instantaneous")
-    assert cases.rows([cases.result(equal), cases.result(icy)])[1]["saving_percent"] is None
+    assert rows_of([cases.result(equal), cases.result(icy)])[1].saving_percent is None
 
 
 def test_a_row_names_what_it_was_made_with(equal, small_policy):
-    row = cases.rows([cases.result(dataclasses.replace(equal, strategy="sdp", policy=str(small_policy)))])[0]
-    assert row["vehicle_hash"] == cases.vehicle_of(VEHICLE, "none").hash
-    assert row["policy_checksum"] == cases.policy_of(str(small_policy)).checksum
-    assert row["settings"]["critical_slip"] == 0.2
+    row = rows_of([cases.result(dataclasses.replace(equal, strategy="sdp", policy=str(small_policy)))])[0]
+    assert row.made_with["vehicle_hash"] == cases.vehicle_of(VEHICLE, "none").hash
+    assert row.made_with["policy_checksum"] == cases.policy_of(str(small_policy)).checksum
+    assert row.made_with["settings"]["critical_slip"] == 0.2
 
 
 def test_the_rule_is_the_best_of_its_lines_on_its_own_cycle(equal, hill, monkeypatch):

@@ -1,23 +1,25 @@
 """The study's pages: from the stored numbers alone, and what docs/study.md shows is what they say."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from iwm_power_manager.errors import ConfigError
-from iwm_sim.study import battery_fit, criteria, pages, paper
+from iwm_sim.metrics import Metrics
+from iwm_sim.study import battery_fit, criteria, labels, pages, paper, study_tables
 from iwm_sim.study.cases import Rule, vehicle_of
+from iwm_sim.study.content import Study
 from iwm_sim.study.report import render
-from iwm_sim.study.reproduce import Material
+from iwm_sim.study.rows import Place, Row, by_place
+from iwm_sim.study.study_figures import Material, drawn
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 @pytest.fixture(scope="module")
 def content():
-    return json.loads((DOCS / "study.json").read_text())
+    return Study.load(DOCS / "study.json")
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +28,7 @@ def material():
     wave = np.sin(time)
     window = {
         label: {"time_s": time, "front_power_w": wave, "rear_power_w": wave, "front_slip": wave, "rear_slip": wave}
-        for label in (criteria.ED, criteria.OURS, pages.GATE_OFF, pages.GATE_TABLE_2)
+        for label in (labels.ED, labels.OURS, labels.GATE_OFF, labels.GATE_TABLE_2)
     }
     estimate = battery_fit.Estimate(0.05, 240.0, 1e-5, {"hill": 1e-5})
     comparison = battery_fit.Comparison(time, wave, wave, 0.8 - time / 1e4, 0.8 - time / 1e4)
@@ -57,43 +59,50 @@ def test_a_document_without_a_place_for_the_tables_is_refused(content, tmp_path)
 
 
 def test_the_stored_criteria_follow_from_the_stored_rows(content):
-    slew = content["settings"]["slew_down_nmps"]
-    again = criteria.check(content["cells"], content["stops"], slew)
-    assert [(made.text, made.met) for made in again] == [(row["text"], row["met"]) for row in content["criteria"]]
+    slew = content.settings["slew_down_nmps"]
+    again = criteria.check(content.cells, content.stops, slew)
+    assert [(made.text, made.met) for made in again] == [(row.text, row.met) for row in content.criteria]
+
+
+def test_a_study_survives_its_file(content):
+    assert Study.from_json(content.to_json()) == content
 
 
 def test_every_cell_of_the_paper_stands_beside_ours(content):
-    tables = [table for table in pages.tables(content) if table.section.startswith("Tables 3 to 5")]
-    assert len(tables) == 6
-    for table in tables:
-        assert [row["cycle"] for row in table.rows] == list(paper.CYCLES)
-        assert all({"paper_ED", "paper_SDP", "ED", "SDP", "ours_saving"} <= set(row) for row in table.rows)
+    made = list(study_tables.paper_tables(content))
+    assert len(made) == 6
+    for table in made:
+        assert [table.columns[0].value(row) for row in table.rows] == list(paper.CYCLES)
+        assert all(column.shown(row) != "–" for row in table.rows for column in table.columns)
 
 
 def test_all_strategies_were_driven_in_all_24_cells(content):
-    by_cell = criteria.cells(content["cells"])
+    by_cell = by_place(content.cells)
     assert len(by_cell) == 24
-    labels = {criteria.ED, criteria.GRDP, criteria.INSTANTANEOUS, criteria.OURS, criteria.BOUND, pages.PAPER_SDP}
-    assert all(labels <= set(by) for by in by_cell.values())
+    wanted = {labels.ED, labels.GRDP, labels.INSTANTANEOUS, labels.OURS, labels.BOUND, labels.PAPER_SDP}
+    assert all(wanted <= set(by) for by in by_cell.values())
 
 
 def test_a_printed_saving_beyond_the_possible_one_is_called_so():
-    def cell(reached, possible):
-        return {
-            pages.PAPER_SDP: {"saving_percent": reached},
-            pages.FREE_BOUND: {"saving_percent": possible},
-        }
+    def row(label, saving):
+        metrics = Metrics(**dict.fromkeys(Metrics._fields, 0.0))
+        return Row(Place("udds", 0.9, "none"), label, "sdp", metrics, saving, None, True)
 
-    assert "more than any split" in pages._verdict(3.0, cell(1.0, 2.0), cell(0.1, 0.5))
-    assert "only if an idle axle costs nothing" in pages._verdict(1.0, cell(1.5, 2.0), cell(0.1, 0.5))
-    assert "reaches it" in pages._verdict(1.0, cell(1.5, 2.0), cell(0.1, 0.5))
-    assert "saves nothing" in pages._verdict(0.3, cell(-0.5, 2.0), cell(0.1, 0.5))
-    assert "cannot be compared" in pages._verdict(0.3, cell(None, 2.0), cell(0.1, 0.5))
+    def verdict(printed, reached, possible, possible_drag=0.5):
+        none = {label: row(label, saving) for label, saving in zip(names, (reached, possible), strict=True)}
+        return study_tables.verdict(printed, none, none | {names[1]: row(names[1], possible_drag)})
+
+    names = (labels.PAPER_SDP, labels.FREE_BOUND)
+    assert "more than any split" in verdict(3.0, 1.0, 2.0)
+    assert "only if an idle axle costs nothing" in verdict(1.0, 1.5, 2.0)
+    assert "reaches it" in verdict(1.0, 1.5, 2.0)
+    assert "saves nothing" in verdict(0.3, -0.5, 2.0)
+    assert "cannot be compared" in verdict(0.3, None, 2.0)
 
 
 def test_page_markdown_and_pictures_are_written(content, material, tmp_path):
     (tmp_path / "figures").mkdir()
-    pictures = pages.drawn(content, material, vehicle_of("jalalmaab_2015", "none").params)
+    pictures = drawn(content.frontier, material, vehicle_of("jalalmaab_2015", "none").params)
     pages.write(tmp_path, content, pictures)
     files = [path.name for path in (tmp_path / "figures").iterdir()]
     for number in ("07", "08", "09", "10", "12", "13", "14", "15"):

@@ -28,6 +28,7 @@ from iwm_sim.study.report import (
     Text,
     Tile,
     Tiles,
+    Verdict,
     format_value,
     render,
     svg_of,
@@ -44,12 +45,18 @@ ROWS = [
 TABLE = Table(
     "Result",
     [
-        Column("strategy", "Strategy"),
-        Column("wh_per_km", "Energy", "Wh/km", 2, best="low"),
-        Column("trace_held", "Trace"),
+        Column("Strategy", lambda row: row["strategy"]),
+        Column("Energy", lambda row: row["wh_per_km"], "Wh/km", 2, best="low"),
+        Column("Trace", lambda row: Verdict(row["trace_held"], "held" if row["trace_held"] else "lost")),
     ],
     ROWS,
+    valid=lambda row: row["trace_held"],
 )
+
+
+def html_of(block):
+    """A page with nothing but a block."""
+    return render(Page("", "", [block]))
 
 
 def full_page():
@@ -155,16 +162,28 @@ def test_a_valid_page_says_so_and_why(page):
 
 
 def test_a_run_that_lost_the_trace_is_marked_and_never_the_best():
-    shown = TABLE.to_html(0)
+    shown = html_of(TABLE)
     rows = re.findall(r"<tr.*?</tr>", shown)[1:]
-    assert ["class=invalid" in row for row in rows] == [False, False, True]
+    assert ['class="invalid"' in row for row in rows] == [False, False, True]
     assert ["✗ lost" in row for row in rows] == [False, False, True]
-    assert ["best" in row for row in rows] == [True, False, False]
+    assert ['class="best"' in row for row in rows] == [True, False, False]
 
 
 def test_an_equal_result_has_no_best():
     rows = [{"strategy": name, "wh_per_km": 80.0, "trace_held": True} for name in "ab"]
-    assert "best" not in Table("", TABLE.columns, rows).to_html(0)
+    assert 'class="best"' not in html_of(Table("", TABLE.columns, rows))
+
+
+def test_columns_of_a_group_stand_below_its_heading():
+    columns = [
+        Column("Cycle", str),
+        *(Column(name, len, "%", 1, group="saving") for name in ("theirs", "ours")),
+        Column("trace", str),
+    ]
+    table = Table("", columns, ["nycc"])
+    assert table.groups == [("", 1), ("saving", 2), ("", 1)]
+    assert '<th colspan="2" class="group">saving</th>' in html_of(table)
+    assert Table("", columns[:1], []).groups == []
 
 
 @pytest.mark.parametrize(
@@ -189,8 +208,8 @@ def test_values_read_as_an_engineer_writes_them(value, decimals, shown):
 def test_a_chart_stays_small_and_keeps_a_spike_of_one_sample():
     speed = np.sin(TIME)
     speed[12_345] = 50.0
-    shown = Chart("", TIME, [Panel("Speed", "m/s", [Series("car", speed)])]).to_html(0)
-    data = json.loads(re.search(r"<script[^>]*>(.*?)</script>", shown).group(1))
+    shown = Chart("", TIME, [Panel("Speed", "m/s", [Series("car", speed)])]).data()
+    data = json.loads(shown)
     values = data["panels"][0]["series"][0]["values"]
     assert len(values) == len(data["time"]) <= CHART_POINTS
     assert max(values) == 50
@@ -199,9 +218,9 @@ def test_a_chart_stays_small_and_keeps_a_spike_of_one_sample():
 
 def test_a_chart_without_a_line_or_with_a_line_of_another_length_is_refused():
     with pytest.raises(ValueError, match="no series"):
-        Chart("Empty", TIME, []).to_html(0)
+        Chart("Empty", TIME, []).data()
     with pytest.raises(ValueError, match="2 values for 60000 times"):
-        Chart("Short", TIME, [Panel("Speed", "m/s", [Series("car", [1.0, 2.0])])]).to_html(0)
+        Chart("Short", TIME, [Panel("Speed", "m/s", [Series("car", [1.0, 2.0])])]).data()
 
 
 samples = st.lists(st.one_of(st.floats(-1e6, 1e6), st.just(float("nan"))), min_size=1, max_size=300)

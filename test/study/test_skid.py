@@ -31,21 +31,21 @@ def test_the_best_stop_is_the_integral_of_the_motion_at_its_slip(car, friction):
 @pytest.mark.parametrize("friction", [0.2, 0.9])
 def test_the_limiter_stops_within_5_percent_of_the_best_and_locks_nothing(friction):
     row = skid.emergency_stop(Stop(VEHICLE, "drag", friction, "limiter", "equal"))
-    assert row["stopped"]
-    assert -0.5 < row["longer_percent"] < 5.0
-    assert row["longest_locked_s"] <= 0.1
+    assert row.stopped
+    assert -0.5 < row.longer_percent < 5.0
+    assert row.longest_locked_s <= 0.1
 
 
 def test_without_a_gate_the_wheels_lock_and_the_car_slides_further():
     off = skid.emergency_stop(Stop(VEHICLE, "drag", 0.2, "off", "equal"))
     limiter = skid.emergency_stop(Stop(VEHICLE, "drag", 0.2, "limiter", "equal"))
-    assert off["min_slip"] == -1.0
-    assert off["locked_s"] > 5.0
-    assert off["distance_m"] > 1.05 * limiter["distance_m"]
+    assert off.min_slip == -1.0
+    assert off.locked_s > 5.0
+    assert off.distance_m > 1.05 * limiter.distance_m
 
 
 def test_nothing_stops_shorter_than_the_best(car):
     for gate_mode in ("off", "table2", "limiter"):
         row = skid.emergency_stop(Stop(VEHICLE, "none", 0.5, gate_mode, "equal", from_mps=10.0))
-        assert row["distance_m"] > 0.99 * skid.best_stop_m(0.5, 10.0, car)[0]
-        assert np.isfinite(row["rms_jerk_mps3"])
+        assert row.distance_m > 0.99 * skid.best_stop_m(0.5, 10.0, car)[0]
+        assert np.isfinite(row.rms_jerk_mps3)

@@ -2,6 +2,7 @@
 
 import json
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,11 +14,12 @@ from iwm_power_manager.cycle import make_cycle
 from iwm_power_manager.nodes import power_manager_config
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
-from iwm_sim import closed_loop, metrics, simulator
+from iwm_sim import closed_loop, dds_drive, metrics, simulator
 from iwm_sim.closed_loop import COLUMNS, Run
 from iwm_sim.drive_bag import DriveBag, problems, with_decisions
+from iwm_sim.metrics import Metrics
 from iwm_sim.plant import initial_plant
-from iwm_sim.study.drive_page import Driven, row
+from iwm_sim.study.drive_page import Driven, DriveRow, row
 from iwm_sim.tools import demo
 
 
@@ -81,19 +83,19 @@ def test_a_bad_argument_is_refused_with_what_is_allowed(capsys, arguments, expec
 
 def test_parameters_keep_their_type_on_the_way_to_a_node():
     values = {"idle_drive": "", "friction": 0.5, "lockstep": True, "policy_file": "1", "rate_hz": 100.0}
-    command = demo.node_command("power_manager", values)
+    command = dds_drive.node_command("power_manager", values)
     given = [command[at + 1] for at, word in enumerate(command) if word == "-p"]
     assert {name: yaml.safe_load(value) for name, value in (text.split(":=", 1) for text in given)} == values
 
 
 def test_every_node_has_its_parameter_file():
-    for node, path in demo.PARAMETER_FILES.items():
+    for node, path in dds_drive.PARAMETER_FILES.items():
         assert resolve(path).is_file(), node
-        assert str(resolve(path)) in demo.node_command(node, {})
+        assert str(resolve(path)) in dds_drive.node_command(node, {})
 
 
 def test_nodes_get_their_domain_on_this_machine(tmp_path):
-    given = demo.environment(tmp_path, 17)
+    given = dds_drive.environment(tmp_path, 17)
     assert given["ROS_DOMAIN_ID"] == "17"
     assert given["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert given["ROS_LOG_DIR"].startswith(str(tmp_path))
@@ -108,19 +110,19 @@ def test_demos_at_the_same_time_have_different_domains(tmp_path, monkeypatch):
             domains.append(environment["ROS_DOMAIN_ID"])
             if len(domains) == 40:
                 raise InterruptedError
-            demo.drive_over_dds(plan, None)
+            dds_drive.drive_over_dds(plan, None)
 
-    monkeypatch.setattr(demo, "Children", AnotherDemoMeanwhile)
+    monkeypatch.setattr(dds_drive, "Children", AnotherDemoMeanwhile)
     with pytest.raises(InterruptedError):
-        demo.drive_over_dds(plan, None)
+        dds_drive.drive_over_dds(plan, None)
     assert len(set(domains)) == 40
 
 
 def test_the_closed_loop_gets_the_settings_the_power_managers_file_gives(monkeypatch):
     monkeypatch.setattr(
-        demo.files, "read_yaml", lambda _: {"/**/power_manager": {"ros__parameters": {"critical_slip": 0.3}}}
+        dds_drive.files, "read_yaml", lambda _: {"/**/power_manager": {"ros__parameters": {"critical_slip": 0.3}}}
     )
-    values = demo.power_manager_parameters()
+    values = dds_drive.power_manager_parameters()
     assert power_manager_config.law_settings(values, "equal").critical_slip == 0.3
     assert values["rate_hz"] == 100.0
 
@@ -129,7 +131,7 @@ def test_the_closed_loop_gets_the_settings_the_power_managers_file_gives(monkeyp
 
 
 def test_equal_runs_are_the_same_whatever_the_law_says_of_itself():
-    same, line = demo.compare(run_of(front_share=np.nan), run_of(front_share=0.5))
+    same, line = dds_drive.compare(run_of(front_share=np.nan), run_of(front_share=0.5))
     assert same
     assert line == "The same drive in one process gives the same numbers, bit for bit."
 
@@ -137,7 +139,7 @@ def test_equal_runs_are_the_same_whatever_the_law_says_of_itself():
 def test_one_bit_of_difference_is_found_with_its_time_and_signal():
     changed = run_of()
     changed.series[50:, COLUMNS.index("speed_mps")] = np.nextafter(1.0, 2.0)
-    same, line = demo.compare(changed, run_of())
+    same, line = dds_drive.compare(changed, run_of())
     assert not same
     assert "differs from 1.00 s on (speed_mps); its energy by 0.0e+00 relative" in line
 
@@ -188,19 +190,9 @@ def test_a_bag_of_other_steps_is_not_mixed_in():
 
 
 def test_the_table_lines_up_and_shows_what_is_missing():
-    values = {
-        "distance_km": 1.9,
-        "wh_per_km": 100.123,
-        "delta_soc_percent": 0.4,
-        "saving_percent": None,
-        "rms_speed_error_mps": 0.1,
-        "min_slip": -0.02,
-        "max_slip": 0.01,
-        "share_changes_per_min": 3.0,
-        "trace_held": False,
-        "made": "one process",
-    }
-    lines = demo.table([{"strategy": "sdp", **values}, {"strategy": "equal", **values, "saving_percent": 1.234}])
+    measured = Metrics(**dict.fromkeys(Metrics._fields, 0.0))._replace(distance_m=1900.0, trace_held=False)
+    first = DriveRow("sdp", "one process", measured, None, 3.0)
+    lines = demo.table([first, replace(first, strategy="equal", saving_percent=1.234)])
     assert len(lines) == 5
     assert "LOST" in lines[3]
     assert "–" in lines[3]
@@ -212,7 +204,7 @@ def test_rows_of_a_car_that_never_moved_are_still_json():
     standing = make_cycle("standing", [0.0, 1.0], [0.0, 0.0])
     run = closed_loop.run(standing, vehicle, default_settings("equal"), empty_table(), 0.9)
     driven = Driven("equal", "one process", run, metrics.measure(run, vehicle.params))
-    assert json.loads(json.dumps(row(driven, driven), allow_nan=False))["wh_per_km"] is None
+    assert json.loads(json.dumps(row(driven, driven).to_json(), allow_nan=False))["wh_per_km"] is None
 
 
 def test_simulator_and_demo_agree_on_the_rate_a_command_line_can_give():

@@ -22,10 +22,10 @@ from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.recorded import RecordedDrive
 from iwm_power_manager.tools import solve_policy
 from iwm_power_manager.vehicle import load_vehicle
-from iwm_sim import closed_loop
+from iwm_sim import closed_loop, learning
+from iwm_sim.learning import CYCLES_ALONE, RECORDING_ALONE, Candidate, Outcome, choose, recorded_cycle, sources_at
 from iwm_sim.metrics import measure
 from iwm_sim.tools import learn
-from iwm_sim.tools.learn import CYCLES_ALONE, RECORDING_ALONE, Candidate, Outcome, choose, recorded_cycle, sources_at
 
 CAR = "jalalmaab_2015"
 
@@ -47,6 +47,12 @@ class TestChoose:
     def test_the_cycles_where_nothing_is_better(self) -> None:
         cycles = outcome(CYCLES_ALONE, 100.0)
         assert choose([outcome(1.0, 100.0), cycles, outcome(2.0, 99.0, 1.5)]) is cycles
+
+    def test_a_gain_that_is_chance_keeps_the_cycles(self) -> None:
+        cycles = outcome(CYCLES_ALONE, 100.0)
+        assert choose([cycles, outcome(1.0, 99.992)]) is cycles
+        better = outcome(1.0, 99.988)
+        assert choose([cycles, better]) is better
 
     def test_a_lost_trace_is_no_saving(self) -> None:
         cycles, honest = outcome(CYCLES_ALONE, 100.0), outcome(2.0, 99.9)
@@ -89,21 +95,21 @@ def test_no_two_candidates_share_a_file() -> None:
         (0.2, 1.0, 1.3),
         (RECORDING_ALONE, 1.0, 1.0),
     ]
-    assert len({learn.policy_path("folder", Candidate(*each)) for each in values}) == len(values)
+    assert len({learning.policy_path("folder", Candidate(*each)) for each in values}) == len(values)
 
 
 def test_the_baseline_comes_first_and_once() -> None:
     problem = load_problem(share_path("config/grids/coupled.yaml"))
-    found = learn.candidates_of(problem, (RECORDING_ALONE, 1.0, CYCLES_ALONE), (1.0, 0.9, 0.9), (1.3, 1.0))
-    assert found[0] == learn.BASELINE and len(found) == len(set(found)) == 3 * 2 * 2
+    found = learning.candidates_of(problem, (RECORDING_ALONE, 1.0, CYCLES_ALONE), (1.0, 0.9, 0.9), (1.3, 1.0))
+    assert found[0] == learning.BASELINE and len(found) == len(set(found)) == 3 * 2 * 2
     assert [candidate.weight for candidate in found] == [0.0] * 4 + [1.0] * 4 + [RECORDING_ALONE] * 4
     without_speed = dataclasses.replace(problem, demand_by_speed=False)
-    assert [each.bandwidth for each in learn.candidates_of(without_speed, (1.0,), (1.0,), (1.3, 2.0))] == [1.0, 1.0]
+    assert [each.bandwidth for each in learning.candidates_of(without_speed, (1.0,), (1.0,), (1.3, 2.0))] == [1.0, 1.0]
 
 
 def test_a_candidate_changes_price_and_bandwidth_and_nothing_else() -> None:
     problem = load_problem(share_path("config/grids/coupled.yaml"))
-    varied = learn.varied(problem, Candidate(1.0, 0.5, 2.0))
+    varied = learning.varied(problem, Candidate(1.0, 0.5, 2.0))
     assert varied.speed_bandwidth_mps == 2.0 * problem.speed_bandwidth_mps
     for friction in (0.2, 0.5, 0.9, 0.7):
         assert varied.on_road(friction).switching_cost_j == 0.5 * problem.on_road(friction).switching_cost_j
@@ -169,11 +175,11 @@ def learned_and_general(bag: Path, folder: Path, friction: float, idle_drive: st
     return [learned, general]
 
 
-def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(nycc_bag: Path, tmp_path: Path) -> None:
+def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(tmp_path: Path) -> None:
     tried = ["--weights", "1", "inf", "--prices", "0.9", "0.8", "--bandwidths", "1"]
-    learned, general = learned_and_general(nycc_bag, tmp_path, 0.2, "drag", tried)
-    energy, cost = cost_of(learned, 0.2, "drag")
-    general_energy, general_cost = cost_of(general, 0.2, "drag")
+    learned, general = learned_and_general(drive_nycc(tmp_path, 0.2, "none"), tmp_path, 0.2, "none", tried)
+    energy, cost = cost_of(learned, 0.2, "none")
+    general_energy, general_cost = cost_of(general, 0.2, "none")
     assert energy < general_energy and cost < general_cost
     (road,) = json.loads((tmp_path / "learn.json").read_text())["roads"]
     order = [(0.0, 1.0), (1.0, 0.8), (1.0, 0.9), ("inf", 0.8), ("inf", 0.9)]
@@ -186,24 +192,28 @@ def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(nyc
     )
     assert (chosen["energy_wh_per_km"], chosen["cost_wh_per_km"]) == pytest.approx((energy, cost))
     assert chosen["energy_wh_per_km"] < road["equal"]["energy_wh_per_km"]
-    assert (chosen["weight"], chosen["price"]) == ("inf", 0.9)
+    assert (chosen["weight"], chosen["price"]) == ("inf", 0.8)
     policy = load_policy(learned)
     assert policy.checksum == road["checksum"]
-    assert policy.problem.switching_cost_j == pytest.approx(54.0 * 0.9)
+    assert policy.problem.switching_cost_j == pytest.approx(54.0 * 0.8)
     assert [source["weight"] for source in policy.sources] == [1.0]
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("friction", [0.9, 0.5, 0.2])
 @pytest.mark.parametrize("idle_drive", ["none", "drag"])
-def test_what_its_nycc_taught_is_better_on_any_road(tmp_path: Path, friction: float, idle_drive: str) -> None:
+def test_what_its_nycc_taught_is_kept_where_it_is_better_than_chance(tmp_path: Path, friction: float, idle_drive: str) -> None:
     bag = drive_nycc(tmp_path, friction, idle_drive)
     learned, general = learned_and_general(bag, tmp_path, friction, idle_drive, [])
     energy, cost = cost_of(learned, friction, idle_drive)
     general_energy, general_cost = cost_of(general, friction, idle_drive)
-    assert energy <= general_energy and cost < general_cost
+    assert energy <= general_energy and cost <= general_cost
     (road,) = json.loads((tmp_path / "learn.json").read_text())["roads"]
-    assert road["chosen_weight"] != CYCLES_ALONE
+    # What is kept from the bag is clearly ahead; what is not is the cycles' own policy.
+    if road["chosen_weight"] == CYCLES_ALONE:
+        assert load_policy(learned).checksum == load_policy(general).checksum
+    else:
+        assert cost < general_cost * (1.0 - learning.CHANCE_PERCENT / 100.0)
 
 
 class TestCommand:

@@ -9,10 +9,12 @@ import sys
 import numpy as np
 import pytest
 
+from iwm_power_manager import solve
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.mdp.demand import chain_of, cycle_power_w, cycle_source, driven_source
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import load_policy, load_policy_bank, policy_bytes
+from iwm_power_manager.replay import demand
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.recorded import RecordedDrive
 from iwm_power_manager.tools import solve_policy
@@ -165,7 +167,7 @@ def recorded(monkeypatch):
     car = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
     power = np.repeat(cycle_power_w(load_cycle(share_path("config/cycles/nycc.csv")), 0.1, car), 10)
     drive = RecordedDrive(0.01 * np.arange(power.size), power, np.zeros(power.size), 3, ["file 2 ends early"])
-    monkeypatch.setattr(solve_policy, "read_signal", lambda bag, mapping, vehicle: drive)
+    monkeypatch.setattr(demand, "read_signal", lambda bag, mapping, vehicle: drive)
     return drive
 
 
@@ -259,7 +261,7 @@ def test_an_interrupt_ends_it_without_a_traceback(grid, tmp_path, monkeypatch, c
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(solve_policy, "build_model", interrupted)
+    monkeypatch.setattr(solve, "build_model", interrupted)
     assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "a.npz", "--quiet") == 130
     assert "interrupted" in capsys.readouterr().err
     assert not (tmp_path / "a.npz").exists()

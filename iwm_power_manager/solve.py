@@ -1,0 +1,84 @@
+"""From a car, a grid and a demand to a policy file: what every command that solves policies calls."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.mdp.demand import DemandChain, Source
+from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
+from iwm_power_manager.mdp.problem import Problem, load_problem
+from iwm_power_manager.mdp.transitions import build_model
+from iwm_power_manager.policy import Policy, cost_quantum_j, make_policy, save_policy
+from iwm_power_manager.share import resolve
+from iwm_power_manager.vehicle import Vehicle
+
+
+class Solved(NamedTuple):
+    """One policy, where it was written and what it took."""
+
+    policy: Policy
+    path: Path
+    build_s: float
+    solve_s: float
+
+
+def load_grid(name: str) -> Problem:
+    """A grid of the package by its name, or of a file."""
+    return load_problem(grid_path(name))
+
+
+def grid_path(name: str) -> Path:
+    """File of a grid: a preset by name, or the file itself."""
+    preset = resolve(f"config/grids/{name}.yaml")
+    return preset if preset.exists() else resolve(name)
+
+
+def targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequence[float]) -> list[Path]:
+    """Where each policy goes; a folder is made, a file is for one policy only."""
+    if len(set(frictions)) != len(frictions):
+        raise ConfigError("arguments", "--friction", "names a value twice")
+    if output.suffix == ".npz":
+        if len(frictions) > 1:
+            raise ConfigError(
+                "arguments", "--output", f"{output} is one file for {len(frictions)} policies", "a folder"
+            )
+        return [output]
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError("arguments", "--output", f"{output}: {error.strerror}", "a folder or a .npz file") from None
+    stem = re.sub(r"[^a-z0-9]+", "_", f"{vehicle.name} {vehicle.idle_drive} {problem.name}".lower()).strip("_")
+    return [output / f"{stem}_mu{round(friction * 100):03d}.npz" for friction in frictions]
+
+
+def solve_one(
+    problem: Problem,
+    vehicle: Vehicle,
+    friction: float,
+    chain: DemandChain,
+    sources: Sequence[Source],
+    path: Path,
+    update: Callable[[Iteration], None] = lambda _: None,
+) -> Solved:
+    """Solve for one road, write the policy, and say what it took; `update` hears of every iteration."""
+    started = time.perf_counter()
+    problem = problem.on_road(friction)
+    model = build_model(problem, vehicle.params, friction, chain.matrix)
+    built = time.perf_counter()
+    solution: Solution = solve(
+        model,
+        problem.share,
+        # What rounding the stored cost-to-go adds is part of the promise.
+        problem.tolerance_j - cost_quantum_j(problem.tolerance_j) / 2.0,
+        problem.max_iterations,
+        update,
+    )
+    done = time.perf_counter()
+    policy = make_policy(problem, vehicle, friction, chain, sources, solution)
+    save_policy(policy, path)
+    return Solved(policy, path, built - started, done - built)

@@ -1,0 +1,173 @@
+"""What results amount to beside each other: a typed row for each, with its saving against equal split."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from iwm_power_manager.control.strategies import STRATEGIES
+from iwm_sim.metrics import Metrics
+from iwm_sim.study.cases import REFERENCE, Case, Result, cycle_of, policy_of, vehicle_of
+
+#: Energies of two runs are compared if the distances differ by no more than this.
+SAME_DISTANCE = 1e-3
+
+#: A possible saving below this, %, has no parts.
+_LEAST_POSSIBLE_PERCENT = 0.01
+
+
+class Place(NamedTuple):
+    """A cell of a table: where strategies are compared."""
+
+    cycle: str
+    friction: float
+    idle_drive: str
+
+    def __str__(self) -> str:
+        return f"{self.cycle} {self.friction:g} {self.idle_drive}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A driven case beside others.
+
+    Attributes
+    ----------
+    place : where it was driven
+    label : what tables call it
+    strategy : name in `STRATEGIES`
+    metrics : what was measured
+    saving_percent : energy saved against equal split of the same drive; None where the distances differ
+    share_of_possible : the saving as a part of `preview`'s, where that was driven and there is anything to save
+    same_distance_as_equal : None without equal split to compare with
+    made_with : settings, hashes and whatever else the numbers depend on, as plain values
+    """
+
+    place: Place
+    label: str
+    strategy: str
+    metrics: Metrics
+    saving_percent: float | None
+    share_of_possible: float | None
+    same_distance_as_equal: bool | None
+    made_with: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """The row as flat plain values; what was not measured is null."""
+        return {
+            **self.place._asdict(),
+            "label": self.label,
+            "strategy": self.strategy,
+            **{name: finite(value) for name, value in self.metrics._asdict().items()},
+            "saving_percent": self.saving_percent,
+            "share_of_possible": self.share_of_possible,
+            "same_distance_as_equal": self.same_distance_as_equal,
+            **self.made_with,
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Row:
+        """A row as `to_json` gave it, without what it was made with."""
+        measured: dict[str, Any] = {
+            name: math.nan if values[name] is None else values[name] for name in Metrics._fields
+        }
+        return cls(
+            place=Place(*(values[name] for name in Place._fields)),
+            metrics=Metrics(**measured),
+            **{name: values[name] for name in _PLAIN},
+        )
+
+
+_PLAIN = ("label", "strategy", "saving_percent", "share_of_possible", "same_distance_as_equal")
+
+
+def finite(value: float) -> float | None:
+    """A number as JSON takes it: NaN (nothing was driven) is null."""
+    return value if isinstance(value, bool) or math.isfinite(value) else None
+
+
+def comparable(one: Metrics, other: Metrics) -> bool:
+    """Whether two runs covered the same distance, so that their energies may be compared."""
+    return abs(one.distance_m - other.distance_m) <= SAME_DISTANCE * other.distance_m
+
+
+def saving_percent(one: Metrics, reference: Metrics) -> float | None:
+    """Energy saved against a reference, %; None where the distances differ."""
+    if not comparable(one, reference) or reference.energy_wh <= 0.0:
+        return None
+    return 100.0 * (1.0 - one.energy_wh / reference.energy_wh)
+
+
+def by_place(rows: Iterable[Row]) -> dict[Place, dict[str, Row]]:
+    """Rows by place, and there by label."""
+    result: dict[Place, dict[str, Row]] = {}
+    for row in rows:
+        result.setdefault(row.place, {})[row.label] = row
+    return result
+
+
+def rows_of(results: Sequence[Result]) -> list[Row]:
+    """A row for each result, with its saving against the equal split of the same drive.
+
+    Results belong together if they differ in nothing but strategy, label, policy and law settings.
+    """
+    references: dict[tuple[Any, ...], Metrics] = {}
+    bounds: dict[tuple[Any, ...], Metrics] = {}
+    for made in results:
+        group = _group(made.case)
+        if made.case.strategy == REFERENCE:
+            references.setdefault(group, made.metrics)
+        if made.case.strategy == "preview":
+            bounds.setdefault(group, made.metrics)
+    return [_row(made, references.get(_group(made.case)), bounds.get(_group(made.case))) for made in results]
+
+
+def _group(case: Case) -> tuple[Any, ...]:
+    return (
+        *(case.cycle, case.vehicle, case.idle_drive, case.friction, case.dt_s, case.substeps, case.soc),
+        *(case.assumed_friction, case.noise, case.car, case.plant),
+    )
+
+
+def _row(made: Result, reference: Metrics | None, bound: Metrics | None) -> Row:
+    case = made.case
+    saving = saving_percent(made.metrics, reference) if reference else None
+    possible = saving_percent(bound, reference) if reference and bound else None
+    worth = saving is not None and possible is not None and possible > _LEAST_POSSIBLE_PERCENT
+    return Row(
+        place=Place(
+            cycle_of(case.cycle).name, case.friction, vehicle_of(case.vehicle, case.idle_drive, case.car).idle_drive
+        ),
+        label=case.name,
+        strategy=case.strategy,
+        metrics=made.metrics,
+        saving_percent=saving,
+        share_of_possible=saving / possible if worth and saving is not None and possible else None,
+        same_distance_as_equal=comparable(made.metrics, reference) if reference else None,
+        made_with=_made_with(case),
+    )
+
+
+def _made_with(case: Case) -> dict[str, Any]:
+    policy = policy_of(case.policy) if case.policy else None
+    vehicle = vehicle_of(case.vehicle, case.idle_drive, case.car)
+    return {
+        "assumed_friction": case.told_friction,
+        "dt_s": case.dt_s,
+        "initial_soc": case.soc,
+        "noise": case.noise._asdict(),
+        "plant_changes": {f"{change.section}.{change.name}": change.value for change in case.plant},
+        "settings": case.settings._replace(strategy=STRATEGIES[case.strategy].code)._asdict(),
+        "rule": list(case.rule) or None,
+        "preview_switching_cost_j": (
+            [case.switching_cost_j, case.switching_fixed_cost_j] if case.strategy == "preview" else None
+        ),
+        "vehicle": vehicle.name,
+        "vehicle_hash": vehicle.hash,
+        "cycle_sha256": cycle_of(case.cycle).sha256,
+        "policy_grid": policy.problem.name if policy else None,
+        "policy_checksum": policy.checksum if policy else None,
+        "policy_friction": policy.friction if policy else None,
+    }

@@ -1,0 +1,175 @@
+"""The figures of a study, with what they need beyond its numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from iwm_power_manager.model.parameters import VehicleParams
+from iwm_sim.metrics import CRITICAL_SLIP
+from iwm_sim.study import battery_fit, figures, sensitivity
+from iwm_sim.study.cases import Rule
+from iwm_sim.study.content import Frontier
+from iwm_sim.study.labels import ED, GATE_OFF, OURS
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class Material(NamedTuple):
+    """What the figures need beyond the study's JSON.
+
+    Attributes
+    ----------
+    battery, rule : fitted
+    convergence : change of the policy and Bellman residual in each iteration
+    window : series of the watched runs, by label
+    chain : transition matrix of the demand, and its axis, W
+    """
+
+    battery: battery_fit.Fit
+    rule: Rule
+    convergence: tuple[FloatArray, FloatArray]
+    window: dict[str, dict[str, FloatArray]]
+    chain: tuple[FloatArray, FloatArray]
+
+
+class Drawn(NamedTuple):
+    """A figure with the name of its file."""
+
+    file: str
+    title: str
+    note: str
+    figure: Figure
+
+
+def drawn(frontier: Frontier, material: Material, vehicle: VehicleParams) -> list[Drawn]:
+    """All figures of a study."""
+    return [
+        battery_figure(material.battery),
+        *depletion_figures(vehicle),
+        *solver_figures(material.convergence, material.chain),
+        rule_figure(material.rule),
+        *window_figures(material.window),
+        frontier_figure(frontier),
+    ]
+
+
+def battery_figure(fit: battery_fit.Fit) -> Drawn:
+    """Figure 7."""
+    return Drawn(
+        "figure_07_battery",
+        "Figure 7: plant and control model",
+        "Speed and state of charge, equal split; the control model has a static circuit, fitted.",
+        figures.model_comparison(*fit.comparison),
+    )
+
+
+def depletion_figures(vehicle: VehicleParams) -> list[Drawn]:
+    """Figures 8 to 10."""
+    return [
+        Drawn(
+            "figure_08_speed",
+            "Figure 8: depletion over the split, by speed",
+            f"Demand {sensitivity.FIG_8_DEMAND_W / 1000:g} kW, both slips 0.01.",
+            figures.depletion_over_split(sensitivity.figure_8(vehicle)),
+        ),
+        Drawn(
+            "figure_09_slip",
+            "Figure 9: depletion over the split, by front slip",
+            f"{sensitivity.FIG_9_SPEED_MPS:g} m/s, demand {sensitivity.FIG_9_DEMAND_W / 1000:g} kW at the wheels, rear "
+            "slip 0.01.",
+            figures.depletion_over_split(sensitivity.figure_9(vehicle)),
+        ),
+        Drawn(
+            "figure_10_demand",
+            "Figure 10: depletion over the split, by demand",
+            f"{sensitivity.FIG_10_SPEED_MPS:g} m/s, both slips 0.01.",
+            figures.depletion_over_split_panels(sensitivity.figure_10(vehicle)),
+        ),
+    ]
+
+
+def solver_figures(convergence: tuple[FloatArray, FloatArray], chain: tuple[FloatArray, FloatArray]) -> list[Drawn]:
+    """Figure 12, and the chain it was solved with."""
+    return [
+        Drawn(
+            "figure_12_convergence",
+            "Figure 12: policy iteration",
+            "The paper's problem, friction 0.9: change of the policy in each iteration, and the Bellman residual, "
+            "which bounds the distance from the optimal cost-to-go.",
+            figures.policy_convergence(*convergence),
+        ),
+        Drawn(
+            "transition_matrix",
+            "Demand as a Markov chain",
+            "Transition matrix of the paper's problem, a step of 0.1 s, from FTP-75, HWFET and NYCC.",
+            figures.transition_matrix(*chain),
+        ),
+    ]
+
+
+def rule_figure(rule: Rule) -> Drawn:
+    """Figure 13."""
+    demand = rule.power_demand_w
+    line_w = np.linspace(demand.min(), demand.max(), 400)
+    return Drawn(
+        "figure_13_rule",
+        "Figure 13: the generalized rule",
+        "Dynamic programming on FTP-75, friction 0.9, and the line fitted to it.",
+        figures.fitted_rule(demand, rule.front_share * demand, line_w, _rule_power(rule.coefficients, line_w)),
+    )
+
+
+def window_figures(window: dict[str, dict[str, FloatArray]]) -> list[Drawn]:
+    """Figures 14 and 15."""
+    ed, ours, without = window[ED], window[OURS], window[GATE_OFF]
+    time_s = ed["time_s"]
+    span = (float(time_s[0]), float(time_s[-1]))
+    powers = [
+        figures.SplitRun(name, run["front_power_w"], run["rear_power_w"]) for name, run in (("ED", ed), ("ours", ours))
+    ]
+    slips = [
+        figures.SlipRun(name, run["front_slip"], run["rear_slip"])
+        for name, run in (("without", without), ("ours", ours))
+    ]
+    return [
+        Drawn(
+            "figure_14_powers",
+            "Figure 14: powers of the axles",
+            "Friction 0.2, idle drive none.",
+            figures.axle_powers(time_s, powers, span),
+        ),
+        Drawn(
+            "figure_15_slips",
+            "Figure 15: slips with and without skid avoidance",
+            "Friction 0.2, idle drive none: the paper's SDP without skid avoidance, and ours.",
+            figures.slips(time_s, slips, CRITICAL_SLIP, span),
+        ),
+    ]
+
+
+def frontier_figure(frontier: Frontier) -> Drawn:
+    """Saving over changes of the share."""
+    families: dict[str, tuple[list[float], list[float]]] = {}
+    for point in frontier.points:
+        if point.family != ED and point.saving_percent is not None:
+            changes, saving = families.setdefault(point.family, ([], []))
+            changes.append(point.share_changes_per_min)
+            saving.append(point.saving_percent)
+    return Drawn(
+        "frontier",
+        "What a change of the share is worth",
+        f"{frontier.cycle}, friction {frontier.friction:g}, idle drive none: saving over changes of the share by more "
+        "than 0.25, along the price of a change.",
+        figures.switching_frontier(families),
+    )
+
+
+def _rule_power(rule: Sequence[float], demand_w: FloatArray) -> FloatArray:
+    """Front power of the rule, as the law applies it (the share stays within 0..1)."""
+    line = np.where(demand_w > 0.0, rule[0] + rule[1] * demand_w, rule[2] + rule[3] * demand_w)
+    return np.clip(line, np.minimum(demand_w, 0.0), np.maximum(demand_w, 0.0))
