@@ -202,7 +202,9 @@ def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(tmp
 @pytest.mark.nightly
 @pytest.mark.parametrize("friction", [0.9, 0.5, 0.2])
 @pytest.mark.parametrize("idle_drive", ["none", "drag"])
-def test_what_its_nycc_taught_is_kept_where_it_is_better_than_chance(tmp_path: Path, friction: float, idle_drive: str) -> None:
+def test_what_its_nycc_taught_is_kept_where_it_is_better_than_chance(
+    tmp_path: Path, friction: float, idle_drive: str
+) -> None:
     bag = drive_nycc(tmp_path, friction, idle_drive)
     learned, general = learned_and_general(bag, tmp_path, friction, idle_drive, [])
     energy, cost = cost_of(learned, friction, idle_drive)
