@@ -1,76 +1,45 @@
-"""One MCAP file being written: chunks, indexes and summary as the MCAP 1.0 specification asks for them.
+"""One MCAP file being written by the `mcap` package, so that whatever happens to it, it ends with a whole record.
 
-Only what a recorder needs, and nothing per message but two appends: schemas and channels go straight into the data
-section (so that they survive whatever happens to a chunk), messages into a chunk in memory, and a finished chunk
-together with its indexes into the file by a single unbuffered `write`. After every `flush` the file can be read by a
-streaming reader up to its last byte, which is what makes a killed recorder's bag recoverable.
+The package's writer hands its bytes to a buffer, and from there they go into the file by unbuffered writes. So a chunk
+is in the file when `flush` returns, which is what makes a killed recorder's bag recoverable, and a write that the disk
+refuses is cut off again. After that the package's writer is of no use: it has taken up what is not in the file. What is
+there stays readable without an index, and `recover` gives it one.
 """
 
 from __future__ import annotations
 
 import errno
 import os
-import struct
-import zlib
-from array import array
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, cast
 
-MAGIC = b"\x89MCAP0\r\n"
-PROFILE = "ros2"
+from mcap.records import Attachment
+from mcap.writer import CompressionType, Writer
+
+from iwm_power_manager.bags.mcap_records import MESSAGE_OVERHEAD_BYTES
+
 COMPRESSIONS = ("none", "lz4", "zstd")
 
-(
-    HEADER,
-    FOOTER,
-    SCHEMA,
-    CHANNEL,
-    MESSAGE,
-    CHUNK,
-    MESSAGE_INDEX,
-    CHUNK_INDEX,
-    _ATTACHMENT,
-    _ATTACHMENT_INDEX,
-    STATISTICS,
-    METADATA,
-    METADATA_INDEX,
-    SUMMARY_OFFSET,
-    DATA_END,
-) = range(1, 16)
 
-_U16 = struct.Struct("<H")
-_U32 = struct.Struct("<I")
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
-_MESSAGE_FIELDS_BYTES = 22
-MESSAGE_OVERHEAD_BYTES = _MESSAGE_HEAD.size
+class _Buffer:
+    """What the package's writer takes for a file: collects bytes, and knows where in the file they will stand."""
 
+    def __init__(self) -> None:
+        self.pieces: list[bytes] = []
+        self.offset = 0
 
-def _text(value: str) -> bytes:
-    encoded = value.encode()
-    return _U32.pack(len(encoded)) + encoded
+    def write(self, data: bytes) -> int:
+        self.pieces.append(data)
+        self.offset += len(data)
+        return len(data)
 
+    def tell(self) -> int:
+        return self.offset
 
-def _text_map(values: Mapping[str, str]) -> bytes:
-    body = b"".join(_text(key) + _text(value) for key, value in values.items())
-    return _U32.pack(len(body)) + body
-
-
-def _record(opcode: int, body: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(body)) + body
-
-
-def compressor(compression: str, level: int = 1) -> Callable[[bytes], bytes]:
-    """Function that compresses one chunk; imports a codec only when it is asked for."""
-    if compression == "zstd":
-        import zstandard
-
-        return zstandard.ZstdCompressor(level=level).compress
-    if compression == "lz4":
-        import lz4.frame
-
-        return lambda data: lz4.frame.compress(data, compression_level=0)
-    return lambda data: data
+    def flush(self) -> None:
+        pass
 
 
 class McapFile:
@@ -82,99 +51,123 @@ class McapFile:
     library : who wrote it, for the header
     compression : "none", "lz4" or "zstd"
     chunk_bytes : uncompressed size at which a chunk is closed
+    profile : whose conventions the file follows
 
     Attributes
     ----------
     size_bytes : what is in the file so far
-    message_count, start_time_ns, end_time_ns : of the messages in closed chunks; times are 0 while there are none
+    message_count, channel_counts, start_time_ns, end_time_ns : of the messages in closed chunks; times are 0 while
+        there are none
+    pending_bytes, pending_count : messages that are in memory only
+    broken : a write has failed
 
     Raises
     ------
     OSError
         From any writing method. Whatever is in the file then ends with a whole record: a half-written one is cut off.
+        Of the messages in memory nothing is left, what comes later is refused, and the file gets no index.
     """
 
-    def __init__(self, path: Path, *, library: str, compression: str = "zstd", chunk_bytes: int = 786_432) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        library: str,
+        compression: str = "zstd",
+        chunk_bytes: int = 786_432,
+        profile: str = "ros2",
+    ) -> None:
         self.path = path
         self.size_bytes = 0
         self.message_count = 0
         self.start_time_ns = 0
         self.end_time_ns = 0
         self.channel_counts: dict[int, int] = {}
-        self._compression = "" if compression == "none" else compression
-        self._compress = compressor(compression)
+        self.pending_bytes = 0
+        self.pending_count = 0
+        self._pending: dict[int, int] = {}
+        self._pending_span = (0, 0)
         self._chunk_bytes = chunk_bytes
-        self._chunk = bytearray()
-        self._index: dict[int, array[int]] = {}
-        self._schemas: list[bytes] = []
-        self._schema_ids: dict[str, int] = {}
-        self._channels: list[bytes] = []
-        self._chunk_indexes: list[bytes] = []
-        self._metadata_indexes: list[bytes] = []
+        self._schema_ids: dict[tuple[str, str, bytes], int] = {}
+        self.broken = False
+        self._buffer = _Buffer()
+        # Chunks are closed here, by size and by time.
+        self._writer = Writer(
+            cast("IO[bytes]", self._buffer), chunk_size=sys.maxsize, compression=CompressionType[compression.upper()]
+        )
+        self._add = self._writer.add_message
         self._stream: IO[bytes] = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by finish() or abandon()
+        self._writer.start(profile, library)
         try:
-            self._append(MAGIC + _record(HEADER, _text(PROFILE) + _text(library)))
+            self._push()
         except OSError:
             self.remove()
             raise
 
-    @property
-    def pending_bytes(self) -> int:
-        """Bytes of messages that are in memory only."""
-        return len(self._chunk)
-
-    @property
-    def pending_count(self) -> int:
-        """Messages that are in memory only."""
-        return sum(len(index) for index in self._index.values()) // 2
-
-    def schema_id(self, name: str, encoding: str, text: str) -> int:
-        """Id of a schema; its record is written at the first call with this name. Id 0 means there is no schema."""
-        if not encoding:
-            return 0
-        if name in self._schema_ids:
-            return self._schema_ids[name]
-        schema_id = len(self._schemas) + 1
-        record = _record(SCHEMA, _U16.pack(schema_id) + _text(name) + _text(encoding) + _text(text))
-        self._append(record)
-        self._schemas.append(record)
-        self._schema_ids[name] = schema_id
-        return schema_id
+    def schema_id(self, name: str, encoding: str, data: bytes) -> int:
+        """Id of a schema, the same for the same schema."""
+        key = (name, encoding, data)
+        if key not in self._schema_ids:
+            self._schema_ids[key] = self._writer.register_schema(name, encoding, data)
+        return self._schema_ids[key]
 
     def add_channel(self, topic: str, schema_id: int, metadata: Mapping[str, str], encoding: str = "cdr") -> int:
-        """Write a channel record; returns its id."""
-        channel_id = len(self._channels) + 1
-        body = struct.pack("<HH", channel_id, schema_id) + _text(topic) + _text(encoding) + _text_map(metadata)
-        record = _record(CHANNEL, body)
-        self._append(record)
-        self._channels.append(record)
-        self._index[channel_id] = array("Q")
-        self.channel_counts[channel_id] = 0
-        return channel_id
+        """Announce a channel; returns its id. It is in the file with the first chunk that follows."""
+        channel = self._writer.register_channel(topic, encoding, schema_id, dict(metadata))
+        self.channel_counts[channel] = 0
+        return channel
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record now, outside of any chunk."""
-        record = _record(METADATA, _text(name) + _text_map(values))
-        offset = self.size_bytes
-        self._append(record)
-        self._metadata_indexes.append(_record(METADATA_INDEX, struct.pack("<QQ", offset, len(record)) + _text(name)))
+        self._check()
+        self._writer.add_metadata(name, dict(values))
+        self._push()
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Write an attachment now, outside of any chunk."""
+        self._check()
+        self._writer.add_attachment(
+            attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
+        )
+        self._push()
+
+    def add_record(self, record: bytes) -> None:
+        """Write a record as it is; for kinds that are not in the index."""
+        self._check()
+        self._buffer.write(record)
+        self._push()
 
     def write(self, channel: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes) -> None:
         """Add a message to the chunk in memory; all numbers >= 0."""
-        chunk = self._chunk
-        head = _MESSAGE_HEAD.pack(
-            MESSAGE, _MESSAGE_FIELDS_BYTES + len(data), channel, sequence, log_time_ns, publish_time_ns
-        )
-        self._index[channel].extend((log_time_ns, len(chunk)))
-        chunk += head
-        chunk += data
-        if len(chunk) >= self._chunk_bytes:
+        self._check()
+        self._add(channel, log_time_ns, data, publish_time_ns, sequence)
+        pending = self._pending
+        pending[channel] = pending.get(channel, 0) + 1
+        if self.pending_count:
+            start, end = self._pending_span
+            if log_time_ns < start:
+                self._pending_span = (log_time_ns, end)
+            elif log_time_ns > end:
+                self._pending_span = (start, log_time_ns)
+        else:
+            self._pending_span = (log_time_ns, log_time_ns)
+        self.pending_count += 1
+        self.pending_bytes += MESSAGE_OVERHEAD_BYTES + len(data)
+        if self.pending_bytes >= self._chunk_bytes:
             self.flush()
 
     def flush(self, sync: bool = False) -> None:
         """Write the chunk in memory, if it holds a message; with `sync` wait until the disk has it."""
-        if self._chunk:
-            self._write_chunk()
+        if self._pending:
+            pending, span = self._pending, self._pending_span
+            self._pending, self.pending_count, self.pending_bytes = {}, 0, 0
+            self._writer.flush()
+            self._push()
+            for channel, count in pending.items():
+                self.channel_counts[channel] += count
+            self.start_time_ns = min(self.start_time_ns, span[0]) if self.message_count else span[0]
+            self.end_time_ns = max(self.end_time_ns, span[1])
+            self.message_count += sum(pending.values())
             if os.fstat(self._stream.fileno()).st_nlink == 0:
                 raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
         if sync:
@@ -184,66 +177,13 @@ class McapFile:
         """A descriptor of the open file that stays valid when this one is closed."""
         return os.dup(self._stream.fileno())
 
-    def _write_chunk(self) -> None:
-        raw = bytes(self._chunk)
-        used = {channel: index for channel, index in self._index.items() if index}
-        start = min(min(index[::2]) for index in used.values())
-        end = max(max(index[::2]) for index in used.values())
-        packed = self._compress(raw)
-        times = struct.pack("<QQ", start, end)
-        sizes = struct.pack("<QI", len(raw), zlib.crc32(raw))
-        name = _text(self._compression)
-        body_bytes = len(times) + len(sizes) + len(name) + 8 + len(packed)
-        chunk_record_bytes = 9 + body_bytes
-        parts = [
-            struct.pack("<BQ", CHUNK, body_bytes),
-            times,
-            sizes,
-            name,
-            struct.pack("<Q", len(packed)),
-            packed,
-        ]
-        offsets = []
-        chunk_offset = self.size_bytes
-        index_offset = chunk_offset + chunk_record_bytes
-        index_bytes = 0
-        for channel, index in used.items():
-            entries = index.tobytes()
-            offsets.append(struct.pack("<HQ", channel, index_offset + index_bytes))
-            record = _record(MESSAGE_INDEX, struct.pack("<HI", channel, len(entries)) + entries)
-            index_bytes += len(record)
-            parts.append(record)
-        offset_map = b"".join(offsets)
-
-        counts = {channel: len(index) // 2 for channel, index in used.items()}
-        self._chunk = bytearray()
-        for channel in used:
-            self._index[channel] = array("Q")
-        self._append(b"".join(parts))
-
-        self._chunk_indexes.append(
-            _record(
-                CHUNK_INDEX,
-                times
-                + struct.pack("<QQ", chunk_offset, chunk_record_bytes)
-                + _U32.pack(len(offset_map))
-                + offset_map
-                + struct.pack("<Q", index_bytes)
-                + name
-                + struct.pack("<QQ", len(packed), len(raw)),
-            )
-        )
-        self.start_time_ns = min(self.start_time_ns, start) if self.message_count else start
-        self.end_time_ns = max(self.end_time_ns, end)
-        for channel, count in counts.items():
-            self.channel_counts[channel] += count
-            self.message_count += count
-
     def finish(self) -> None:
-        """Write the last chunk and the summary, and close the file."""
+        """Write the last chunk and the index, and close the file."""
         try:
             self.flush()
-            self._append(self._end())
+            self._check()
+            self._writer.finish()
+            self._push()
             os.fsync(self._stream.fileno())
         finally:
             self._stream.close()
@@ -257,47 +197,19 @@ class McapFile:
         self._stream.close()
         self.path.unlink(missing_ok=True)
 
-    def _end(self) -> bytes:
-        data_end = _record(DATA_END, _U32.pack(0))
-        counts = b"".join(struct.pack("<HQ", channel, count) for channel, count in self.channel_counts.items() if count)
-        statistics = _record(
-            STATISTICS,
-            struct.pack(
-                "<QHIIIIQQ",
-                self.message_count,
-                len(self._schemas),
-                len(self._channels),
-                0,
-                len(self._metadata_indexes),
-                len(self._chunk_indexes),
-                self.start_time_ns,
-                self.end_time_ns,
-            )
-            + _U32.pack(len(counts))
-            + counts,
-        )
-        groups = (
-            (SCHEMA, self._schemas),
-            (CHANNEL, self._channels),
-            (STATISTICS, [statistics]),
-            (CHUNK_INDEX, self._chunk_indexes),
-            (METADATA_INDEX, self._metadata_indexes),
-        )
-        summary_start = self.size_bytes + len(data_end)
-        summary = bytearray()
-        summary_offsets = bytearray()
-        for opcode, records in groups:
-            if not records:
-                continue
-            start = summary_start + len(summary)
-            group = b"".join(records)
-            summary += group
-            summary_offsets += _record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, start, len(group)))
-        offset_start = summary_start + len(summary)
-        summary += summary_offsets
-        footer = struct.pack("<BQQQ", FOOTER, 20, summary_start, offset_start)
-        crc = zlib.crc32(footer, zlib.crc32(summary))
-        return data_end + bytes(summary) + footer + _U32.pack(crc) + MAGIC
+    def _check(self) -> None:
+        if self.broken:
+            raise OSError(errno.EIO, "an earlier write has failed")
+
+    def _push(self) -> None:
+        """Bring what the writer has written into the file."""
+        data = b"".join(self._buffer.pieces)
+        self._buffer.pieces.clear()
+        try:
+            self._append(data)
+        except OSError:
+            self.broken = True
+            raise
 
     def _append(self, data: bytes) -> None:
         view = memoryview(data)

@@ -1,22 +1,44 @@
-"""Make a valid bag of what a killed or starved recorder left on the disk.
+"""Make a valid bag of what a killed or starved recorder left on the disk, whoever's it was.
 
-Each file that has no proper end is written anew, message by message, with index and summary, and takes the place of
-the damaged one; then `metadata.yaml` is made. The original is kept, as `<name>.damaged`, if a part in its middle could
-not be read: what stands there is lost to us, but perhaps not to a specialist.
+All that can be read of a file is written anew by the `mcap` package: messages, schemas in any language, attachments,
+metadata, and as bytes the records it does not know. What was compressed to a file, or is a damaged sqlite3 file,
+becomes an MCAP file beside it. The copy is read and counted before it takes the original's place, and an original of
+which something could not be read is kept. A chunk that was cut off counts as that: its checksum is of all of it, and
+what a power cut has left of a part may be zeros that look like messages.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
+import sqlite3
+import tempfile
+from collections import Counter
+from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata
+
+from iwm_power_manager.bags.limits import ZSTD_MAGIC, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_file import McapFile
-from iwm_power_manager.bags.mcap_scan import McapScan
-from iwm_power_manager.bags.metadata import CUSTOM_METADATA, METADATA_FILE, FileSpan, Topic
-from iwm_power_manager.bags.reader import BagReader, custom_data_of, recording_order, topic_of
-from iwm_power_manager.bags.writer import LIBRARY, announce, finish, span_of, write_metadata
+from iwm_power_manager.bags.mcap_records import (
+    UNREADABLE,
+    Definitions,
+    Record,
+    read_record,
+    split,
+    walk,
+)
+from iwm_power_manager.bags.mcap_source import McapSource
+from iwm_power_manager.bags.metadata import METADATA_FILE, FileSpan, Topic, text_values
+from iwm_power_manager.bags.reader import COMPRESSED_SUFFIX, SUFFIXES, BagReader, data_files, open_source
+from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
 from iwm_power_manager.errors import BagError
+from iwm_power_manager.files import sync_folder
+
+_FIRST_PRIVATE = 0x80
 
 
 class FileRecovery(NamedTuple):
@@ -29,15 +51,30 @@ class FileRecovery(NamedTuple):
     message_count : messages in it now
     damage : what was wrong with it; "" for a whole file
     discarded_bytes : torn bytes at its end
-    lost_chunks : chunks in its middle that could not be read
+    lost_chunks : chunks, or stretches of the file, that could not be read
+    kept : name of the original, where it is kept; "" where the rebuilt file has taken its place
     """
 
     name: str
     rebuilt: bool
     message_count: int
     damage: str
-    discarded_bytes: int
-    lost_chunks: int
+    discarded_bytes: int = 0
+    lost_chunks: int = 0
+    kept: str = ""
+
+    def lines(self) -> list[str]:
+        """The report for the user."""
+        if not self.rebuilt:
+            state = f"left out: {self.damage}" if self.damage else f"whole, {self.message_count} messages"
+            return [f"  {self.name}: {state}"]
+        out = [f"  {self.name}: {self.damage}; rebuilt with {self.message_count} messages, "
+               f"{self.discarded_bytes} torn bytes at its end discarded"]  # fmt: skip
+        if self.lost_chunks:
+            out.append(f"  {self.name}: {self.lost_chunks} chunk(s) unreadable")
+        if self.kept:
+            out.append(f"  {self.name}: original kept as {self.kept}")
+        return out
 
 
 class Recovery(NamedTuple):
@@ -65,149 +102,319 @@ class Recovery(NamedTuple):
         span = (self.end_ns - self.start_ns) * 1e-9
         out = [f"{self.path}: {total} messages over {span:.3f} s in {len(self.files)} file(s)"]
         for file in self.files:
-            if not file.rebuilt:
-                state = f"left out: {file.damage}" if file.damage else f"whole, {file.message_count} messages"
-                out.append(f"  {file.name}: {state}")
-                continue
-            out.append(
-                f"  {file.name}: {file.damage}; rebuilt with {file.message_count} messages, "
-                f"{file.discarded_bytes} torn bytes at its end discarded"
-            )
-            if file.lost_chunks:
-                out.append(
-                    f"  {file.name}: {file.lost_chunks} chunk(s) unreadable; original kept as {file.name}.damaged"
-                )
+            out += file.lines()
         for topic, count in sorted(self.missing.items()):
             out.append(f"  {topic}: {count} messages missing in between, by the publisher's counter")
-        out.append("  metadata.yaml written" if self.metadata_written else "  nothing to recover")
+        if self.metadata_written:
+            out.append("  metadata.yaml written")
+        elif not any(file.rebuilt for file in self.files):
+            out.append("  nothing to recover")
         return out
 
 
 def recover(path: Path | str) -> Recovery:
-    """Make the MCAP bag in a folder valid; a bag that is valid already stays untouched.
+    """Make a bag valid; one that is valid already stays untouched.
+
+    Parameters
+    ----------
+    path : a bag's folder, or one `.mcap`, `.db3`, `.mcap.zstd` or `.db3.zstd` file
 
     Raises
     ------
     BagError
-        There is no such folder, no MCAP file in it, or no room for the rebuilt file.
+        There is no such bag, nothing in it can be read, or there is no room for the rebuilt file.
     """
-    folder = Path(path)
-    if not folder.is_dir():
-        raise BagError(f"{folder}: is no folder" if folder.exists() else f"{folder}: does not exist")
-    names = sorted(folder.glob("*.mcap"), key=recording_order)
+    path = Path(path)
+    if not path.exists():
+        raise BagError(f"{path}: does not exist")
+    with ExitStack() as stack:
+        files: list[_File] = []
+        reports: list[FileRecovery] = []
+        for name in _names(path):
+            try:
+                files.append(_File(name, stack))
+            except BagError as error:
+                reports.append(FileRecovery(name.name, False, 0, str(error)))
+        if not files:
+            raise BagError(f"{reports[0].damage}; nothing to recover")
+        valid = path.is_dir() and not reports and _is_valid(path)
+        sqlite = all(file.is_sqlite and not file.problem for file in files)
+        for file in files:
+            if file.problem or (file.is_sqlite and not sqlite) or (file.is_compressed and not valid):
+                file.rebuild()
+        for file in files:
+            file.put_in_place()
+        stale = path.is_dir() and (not valid or any(file.report.rebuilt for file in files))
+        if stale:
+            _write_metadata(path, files, "sqlite3" if sqlite else "mcap")
+        missing: Counter[str] = Counter()
+        last: dict[str, int] = {}
+        for file in files:
+            missing.update(file.seen.missing(last))
+        spans = [file.seen.span for file in files if file.seen.count]
+        start_ns, end_ns = min((span[0] for span in spans), default=0), max((span[1] for span in spans), default=0)
+        return Recovery(path, [file.report for file in files] + reports, dict(missing), start_ns, end_ns, stale)
+
+
+def _names(path: Path) -> list[Path]:
+    """Data files; not those of which an earlier recovery has left its result beside them."""
+    if not path.is_dir():
+        if not path.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES):
+            raise BagError(f"{path}: is no folder and no .mcap or .db3 file")
+        return [path]
+    names = data_files(path)
+    names = [name for name in names if _target(name) == name or _target(name) not in names]
     if not names:
-        raise BagError(f"{folder}: holds no .mcap file")
-    bag = _Bag()
-    files = [_recover_file(name, bag) for name in names]
-    if not bag.spans:
-        raise BagError(f"{files[0].damage}; nothing to recover")
-    stale = any(file.damage for file in files) or not _is_valid(folder)
-    if stale:
-        write_metadata(folder, bag.spans, bag.topics(), bag.custom_data)
-    filled = [span for span in bag.spans if span.message_count]
-    return Recovery(
-        folder,
-        files,
-        bag.missing,
-        min((span.start_ns for span in filled), default=0),
-        max((span.end_ns for span in filled), default=0),
-        stale,
-    )
+        raise BagError(f"{path}: holds no .mcap or .db3 file")
+    return names
 
 
-class _Bag:
-    """What is known of the whole bag while its files are gone through."""
-
-    def __init__(self) -> None:
-        self.spans: list[FileSpan] = []
-        self.custom_data: dict[str, str] = {}
-        self.missing: dict[str, int] = {}
-        self._topics: dict[str, Topic] = {}
-        self._counts: dict[str, int] = {}
-        self._last: dict[str, int] = {}
-
-    def add(self, span: FileSpan, counts: dict[Topic, int]) -> None:
-        """Count a file."""
-        self.spans.append(span)
-        for topic, count in counts.items():
-            self._topics.setdefault(topic.name, topic)
-            self._counts[topic.name] = self._counts.get(topic.name, 0) + count
-
-    def topics(self) -> list[tuple[Topic, int]]:
-        """All topics with their counts."""
-        return [(topic, self._counts[name]) for name, topic in self._topics.items()]
-
-    def note(self, topic: str, sequence: int) -> None:
-        """Count what is missing before a message, by its publisher's counter."""
-        last = self._last.get(topic, 0)
-        if last and sequence > last + 1:
-            self.missing[topic] = self.missing.get(topic, 0) + sequence - last - 1
-        if sequence:
-            self._last[topic] = sequence
-
-
-def _recover_file(path: Path, bag: _Bag) -> FileRecovery:
-    try:
-        scan = McapScan(path)
-    except BagError as error:
-        return FileRecovery(path.name, False, 0, str(error), 0, 0)
-    with scan:
-        if not scan.channels:
-            scan.read_definitions()
-        topics = {number: topic_of(channel) for number, channel in scan.channels.items()}
-        own = custom_data_of(scan)
-        bag.custom_data.update(own)
-        if not scan.damage:
-            span, counts = _survey(path, scan)
-            if not scan.damage:  # reading did not find any either
-                bag.add(span, {topics[number]: counts.get(number, 0) for number in topics})
-                return FileRecovery(path.name, False, span.message_count, "", 0, 0)
-        damage, torn_bytes = scan.damage, scan.size_bytes - scan.end_offset
-        file, written = _rebuild(path, scan, topics, own, bag)
-        bag.add(span_of(file)._replace(name=path.name), written)
-        return FileRecovery(path.name, True, file.message_count, damage, torn_bytes, scan.lost_chunks)
-
-
-def _survey(path: Path, scan: McapScan) -> tuple[FileSpan, dict[int, int]]:
-    counts: dict[int, int] = {}
-    for _, number, _, _, _ in scan.messages():
-        counts[number] = counts.get(number, 0) + 1
-    return FileSpan(path.name, scan.start_ns, scan.end_ns, sum(counts.values())), counts
-
-
-def _rebuild(
-    path: Path, scan: McapScan, topics: dict[int, Topic], custom_data: dict[str, str], bag: _Bag
-) -> tuple[McapFile, dict[Topic, int]]:
-    """Write what `scan` can read to a new file, and put that in the place of the old one."""
-    temporary = path.with_name(path.name + ".recovering")
-    scan.lost_chunks = 0
-    try:
-        temporary.unlink(missing_ok=True)
-        file = McapFile(temporary, library=LIBRARY)
-        try:
-            if custom_data:
-                file.add_metadata(CUSTOM_METADATA, custom_data)
-            channels = {number: announce(file, topic) for number, topic in topics.items()}
-            for log_time, number, data, publish_time, sequence in scan.messages():
-                if number in channels:
-                    bag.note(topics[number].name, sequence)
-                    file.write(channels[number], log_time, publish_time, sequence, data)
-            finish(file, [(topics[number], channel) for number, channel in channels.items()], custom_data)
-        except BaseException:
-            file.abandon()
-            temporary.unlink(missing_ok=True)
-            raise
-        if scan.lost_chunks:
-            os.replace(path, path.with_name(path.name + ".damaged"))
-        os.replace(temporary, path)
-    except OSError as error:
-        raise BagError(f"{temporary}: cannot be written: {error.strerror or error}") from None
-    return file, {topics[number]: file.channel_counts[channel] for number, channel in channels.items()}
+def _target(path: Path) -> Path:
+    """Where the recovered file goes."""
+    return path.with_name(path.name.removesuffix(COMPRESSED_SUFFIX)).with_suffix(".mcap")
 
 
 def _is_valid(folder: Path) -> bool:
-    """Whether the metadata is there and speaks of files that are."""
-    if not (folder / METADATA_FILE).is_file():
+    """Whether the metadata is there, makes sense, and speaks of all files that are."""
+    try:
+        with BagReader(folder) as bag:
+            listed = {str(name).rpartition("/")[2] for name in bag.information.get("relative_file_paths") or []}
+            return not bag.damage and listed == {name.name for name in _names(folder)}
+    except BagError:
         return False
-    with BagReader(folder) as bag:
-        return not bag.damage
+
+
+class _Seen:
+    """All messages of an MCAP or sqlite3 file, read and counted.
+
+    Attributes
+    ----------
+    source : the file
+    count, span : messages, and the log times of the first and the last
+    topics : each topic with the number of its messages
+    compressed : the messages are compressed one by one
+    """
+
+    def __init__(self, source: Any) -> None:
+        self.source = source
+        counts: Counter[int] = Counter()
+        self._numbers: list[tuple[int, int]] = []
+        self.compressed = False
+        start_ns, end_ns = 2**64, 0
+        own = is_own(source)
+        for log_time, channel, data, _, sequence, _ in source.messages():
+            counts[channel] += 1
+            start_ns, end_ns = min(start_ns, log_time), max(end_ns, log_time)
+            if sequence and own:  # other recorders count something else
+                self._numbers.append((channel, sequence))
+            self.compressed = self.compressed or data[:4] == ZSTD_MAGIC
+        self.count = counts.total()
+        self.span = (start_ns, end_ns) if self.count else (0, 0)
+        self.topics: list[tuple[Topic, int]] = [(topic, counts[number]) for number, topic in source.topics().items()]
+
+    def missing(self, last: dict[str, int]) -> Counter[str]:
+        """By topic, numbers left out; `last` holds each topic's last number of the files before, and is brought on."""
+        found: Counter[str] = Counter()
+        names = {number: topic.name for number, topic in self.source.topics().items()}
+        for channel, number in self._numbers:
+            name = names.get(channel, "")
+            before = last.get(name, 0)
+            if before and number > before + 1:
+                found[name] += number - before - 1
+            last[name] = number
+        return found
+
+
+class _File:
+    """A data file and what becomes of it.
+
+    Attributes
+    ----------
+    problem : what is wrong with it; "" for a whole one
+    report, seen : of the original, and once it is rebuilt of the result
+    """
+
+    def __init__(self, path: Path, stack: ExitStack) -> None:
+        self._stack = stack
+        self.path = path
+        self.is_sqlite = path.name.removesuffix(COMPRESSED_SUFFIX).endswith(".db3")
+        self.is_compressed = path.suffix == COMPRESSED_SUFFIX
+        self._temporary: Path | None = None
+        regular_file(path)
+        opened, problem = _opened(path, stack)
+        self.seen = _Seen(open_source(opened, stack))
+        self.problem = problem or "; ".join(self.seen.source.damage[:3])
+        self.report = FileRecovery(path.name, False, self.seen.count, "")
+
+    def rebuild(self) -> None:
+        """Write what can be read to a file of its own, and read that."""
+        source, target = self.seen.source, _target(self.path)
+        temporary = target.with_name(target.name + ".recovering")
+        try:
+            temporary.unlink(missing_ok=True)
+            self._stack.callback(temporary.unlink, missing_ok=True)
+            copy = _Copy(source, temporary)
+            made = _Seen(open_source(temporary, self._stack, ".mcap"))
+        except OSError as error:
+            raise BagError(f"{temporary}: cannot be written: {error.strerror or error}") from None
+        if made.source.damage or made.count < self.seen.count:
+            raise BagError(
+                f"{temporary}: holds {made.count} of {self.seen.count} messages; the original is left as it is"
+            )
+        kept = self.path.name if target != self.path else ""
+        if target == self.path and (copy.lost or copy.torn):
+            kept = f"{target.name}.damaged"
+        what = self.problem or ("is compressed" if self.is_compressed else "is sqlite3 beside MCAP")
+        self.report = FileRecovery(target.name, True, made.count, what, copy.torn, copy.lost, kept)
+        self.seen, self.path, self._temporary = made, target, temporary
+
+    def put_in_place(self) -> None:
+        """Let the rebuilt file take its place."""
+        if self._temporary is None:
+            return
+        keep = self.path.with_name(self.report.kept) if self.report.kept.endswith(".damaged") else None
+        try:
+            if keep is not None:
+                keep.unlink(missing_ok=True)
+                _second_name(self.path, keep)
+            os.replace(self._temporary, self.path)
+            sync_folder(self.path.parent)
+        except OSError as error:
+            raise BagError(f"{self._temporary}: cannot be written: {error.strerror or error}") from None
+
+    def distro(self) -> str:
+        """ROS distribution as the file knows it; "" for this one, in a file of this project."""
+        source = self.seen.source
+        if not isinstance(source, McapSource):
+            return ""
+        known = source.information().get("ros_distro") or source.metadata.get("rosbag2", {}).get("ROS_DISTRO")
+        return str(known or ("" if is_own(source) else "unknown"))
+
+
+def _second_name(path: Path, other: Path) -> None:
+    try:
+        os.link(path, other)
+    except OSError:  # a file system without links
+        shutil.copy2(path, other)
+
+
+def is_own(source: Any) -> bool:
+    """Whether this project's recorder has written a file."""
+    return isinstance(source, McapSource) and source.header().library.startswith(LIBRARY.partition(" ")[0])
+
+
+def _opened(path: Path, stack: ExitStack) -> tuple[Path, str]:
+    """The file itself, or a copy that can be read, and what is wrong with it."""
+    journals = [journal for end in ("-wal", "-journal") if (journal := path.with_name(path.name + end)).is_file()]
+    if path.suffix != COMPRESSED_SUFFIX and not journals:
+        return path, ""
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_recover_", dir=path.parent)))
+    copied = folder / path.name.removesuffix(COMPRESSED_SUFFIX)
+    if path.suffix == COMPRESSED_SUFFIX:
+        return copied, decompress_file(path, copied)
+    for file in (path, *journals):
+        regular_file(file)
+        shutil.copyfile(file, folder / file.name)
+    try:
+        with closing(sqlite3.connect(copied)) as database:
+            database.execute("PRAGMA journal_mode = DELETE")
+    except sqlite3.Error:
+        pass  # then it is read without
+    return copied, "has a journal: the recorder did not finish"
+
+
+class _Copy:
+    """Writes what can be read of a file to a new MCAP file.
+
+    Attributes
+    ----------
+    lost : chunks, or stretches without a record, that could not be read
+    torn : bytes at the end that hold no whole record
+    """
+
+    def __init__(self, source: Any, target: Path) -> None:
+        self.lost = 0
+        self.torn = 0
+        self._source = source
+        profile = source.header().profile if isinstance(source, McapSource) else "ros2"
+        library = source.header().library if isinstance(source, McapSource) else LIBRARY
+        self._file = McapFile(target, library=library or LIBRARY, profile=profile)
+        try:
+            if isinstance(source, McapSource):
+                self._channels = self._announced(source)
+                for record in walk(source.data):
+                    self._take(source, record)
+            else:
+                self._channels = {number: announce(self._file, topic) for number, topic in source.topics().items()}
+                self._write(source.messages())
+            self._file.finish()
+        except BaseException:
+            self._file.abandon()
+            raise
+
+    def _announced(self, source: McapSource) -> dict[int, int]:
+        """All channels with their schemas; the numbers they have in the new file."""
+        definitions, channels = source.definitions, {}
+        for number in sorted(source.counts.keys() - definitions.channels.keys()):
+            # Its announcement is lost; what was sent on it is not.
+            definitions.channels[number] = Channel(number, f"/recovered/channel_{number}", "cdr", {}, 0)
+        for number, channel in definitions.channels.items():
+            schema = definitions.schema_of(channel)
+            schema_id = self._file.schema_id(schema.name, schema.encoding, schema.data) if schema.id else 0
+            channels[number] = self._file.add_channel(
+                channel.topic, schema_id, channel.metadata, channel.message_encoding
+            )
+        return channels
+
+    def _take(self, source: McapSource, record: Record) -> None:
+        if record.opcode == Opcode.CHUNK:
+            try:
+                self._write(split(source.raw(record.start, record.end), Definitions()))
+            except BagError:
+                self.lost += 1
+        elif record.opcode == Opcode.MESSAGE:
+            self._write(split(source.data[record.start : record.end], Definitions()))
+        elif record.opcode == Opcode.ATTACHMENT:
+            found = read_record(Attachment, source.body(record))
+            self._file.add_attachment(found)
+        elif record.opcode == Opcode.METADATA:
+            metadata = read_record(Metadata, source.body(record))
+            self._file.add_metadata(metadata.name, metadata.metadata)
+        elif record.opcode >= _FIRST_PRIVATE:
+            self._file.add_record(bytes(source.data[record.start : record.end]))
+        elif record.opcode == UNREADABLE and record.end < len(source.data):
+            self.lost += 1
+        elif record.opcode == UNREADABLE:
+            self.torn = record.end - record.start
+
+    def _write(self, messages: Any) -> None:
+        for log_time, channel, data, publish_time, sequence, _ in messages:
+            self._file.write(self._channels[channel], log_time, publish_time, sequence, data)
+
+
+def _write_metadata(folder: Path, files: list[_File], storage: str) -> None:
+    """`metadata.yaml` of the whole bag, with what the old one or the files know of it."""
+    recorded: dict[str, Any] = {}
+    if (folder / METADATA_FILE).is_file():
+        try:
+            with BagReader(folder) as bag:
+                recorded = bag.information
+        except BagError:
+            pass  # what it says may still be read from the files
+    topics: dict[str, Topic] = {}
+    counts: Counter[str] = Counter()
+    custom_data: dict[str, str] = {}
+    for file in files:
+        custom_data.update(file.seen.source.custom_data())
+        for topic, count in file.seen.topics:
+            topics.setdefault(topic.name, topic)
+            counts[topic.name] += count
+    write_metadata(
+        folder,
+        [FileSpan(file.path.name, *file.seen.span, file.seen.count) for file in files],
+        [(topic, counts[name]) for name, topic in topics.items()],
+        custom_data | text_values(recorded.get("custom_data")),
+        storage=storage,
+        distro=str(recorded.get("ros_distro") or next(filter(None, (file.distro() for file in files)), "")),
+        compression="zstd" if any(file.seen.compressed for file in files) else "",
+    )

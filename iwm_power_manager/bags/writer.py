@@ -257,7 +257,10 @@ class BagWriter:
 
     def _finish_file(self, file: McapFile) -> None:
         try:
-            finish(file, list(zip(self._topics, self._channels, strict=True)), self.custom_data)
+            if file.broken:
+                file.abandon()
+            else:
+                finish(file, list(zip(self._topics, self._channels, strict=True)), self.custom_data)
         except OSError as error:
             file.abandon()
             raise self._failed(error) from None
@@ -286,10 +289,10 @@ def _make_folder(path: Path) -> None:
 
 def announce(file: McapFile, topic: Topic) -> int:
     """Write a topic's schema and channel into a file; returns the channel's id."""
-    schema = file.schema_id(topic.type, "ros2msg" if topic.definition else "", topic.definition)
-    return file.add_channel(
-        topic.name, schema, {"offered_qos_profiles": qos_text(topic.qos), "topic_type_hash": topic.type_hash}
-    )
+    definition = topic.definition.encode("utf-8", "surrogateescape")
+    schema = file.schema_id(topic.type, topic.encoding, definition) if definition else 0
+    metadata = {"offered_qos_profiles": qos_text(topic.qos), "topic_type_hash": topic.type_hash}
+    return file.add_channel(topic.name, schema, metadata, topic.serialization)
 
 
 def finish(file: McapFile, channels: Sequence[tuple[Topic, int]], custom_data: Mapping[str, str]) -> None:
@@ -307,11 +310,18 @@ def span_of(file: McapFile) -> FileSpan:
 
 
 def write_metadata(
-    folder: Path, spans: Sequence[FileSpan], topics: Sequence[tuple[Topic, int]], custom_data: Mapping[str, str]
+    folder: Path,
+    spans: Sequence[FileSpan],
+    topics: Sequence[tuple[Topic, int]],
+    custom_data: Mapping[str, str],
+    *,
+    storage: str = "mcap",
+    distro: str = "",
+    compression: str = "",
 ) -> None:
-    """Write a bag's `metadata.yaml`; `BagError` if it cannot be."""
-    text = metadata_text(bag_information("mcap", spans, topics, custom_data))
+    """Write a bag's `metadata.yaml`; `BagError` if it cannot be. Arguments as of `metadata.bag_information`."""
+    information = bag_information(storage, spans, topics, custom_data, distro=distro, compression=compression)
     try:
-        atomic_write(folder / METADATA_FILE, text.encode())
+        atomic_write(folder / METADATA_FILE, metadata_text(information).encode())
     except ConfigError as error:
         raise BagError(str(error)) from None

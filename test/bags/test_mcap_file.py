@@ -10,11 +10,12 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 
 from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
+from iwm_power_manager.bags.recover import recover
 
 
 def fill(path: Path, count: int, **options: object) -> McapFile:
     file = McapFile(path, library="test", **options)  # type: ignore[arg-type]
-    schema = file.schema_id("pkg/msg/A", "ros2msg", "float64 data")
+    schema = file.schema_id("pkg/msg/A", "ros2msg", b"float64 data")
     channels = [file.add_channel(f"/t{i}", schema, {"key": "value"}) for i in range(3)]
     for i in range(count):
         file.write(channels[i % 3], 1000 + i, 900 + i, i, bytes([i % 256]) * (i % 50))
@@ -91,7 +92,7 @@ def test_an_existing_file_is_never_touched(tmp_path: Path) -> None:
     assert (tmp_path / "a.mcap").read_bytes() == b"precious"
 
 
-def test_a_half_written_chunk_is_cut_off_so_that_the_file_can_still_be_finished(
+def test_a_half_written_chunk_is_cut_off_and_what_was_written_before_is_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = fill(tmp_path / "a.mcap", 100)
@@ -120,10 +121,13 @@ def test_a_half_written_chunk_is_cut_off_so_that_the_file_can_still_be_finished(
     with pytest.raises(OSError, match="No space left"):
         file.flush()
     monkeypatch.setattr(file, "_stream", stream)
-    assert file.message_count == 100
-    file.finish()
-    with (tmp_path / "a.mcap").open("rb") as readable:
-        assert sum(1 for _ in make_reader(readable, validate_crcs=True).iter_messages()) == 100
+    assert (file.message_count, file.broken) == (100, True)
+    with pytest.raises(OSError, match="an earlier write has failed"):
+        file.write(1, 6000, 0, 0, b"")
+    file.abandon()
+    assert (tmp_path / "a.mcap").stat().st_size == file.size_bytes
+    report = recover(tmp_path / "a.mcap").files[0]
+    assert (report.rebuilt, report.message_count, report.discarded_bytes, report.kept) == (True, 100, 0, "")
 
 
 def test_a_file_removed_while_it_is_written_is_noticed_at_the_next_flush(tmp_path: Path) -> None:

@@ -195,7 +195,11 @@ def test_what_is_no_bag_gets_one_clear_line(tmp_path: Path, kind: str) -> None:
         path.write_text("x")
     elif kind == "empty":
         path.mkdir()
-    expected = {"missing": "does not exist", "file": "is no folder", "empty": r"holds no \.mcap file"}[kind]
+    expected = {
+        "missing": "does not exist",
+        "file": "is no folder and no .mcap",
+        "empty": r"holds no \.mcap or \.db3 file",
+    }[kind]
     with pytest.raises(BagError, match=f"bag: {expected}"):
         recover(path)
 

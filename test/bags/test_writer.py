@@ -167,7 +167,8 @@ def test_what_was_written_before_the_disk_was_full_stays_readable(tmp_path: Path
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     with BagReader(tmp_path / "bag") as reader:
         times = [m.log_time_ns for m in reader.messages()]
-        assert reader.damage == []
+        (line,) = reader.damage
+    assert "ends without a footer" in line
     assert times == list(range(bag.message_count))
     assert len(times) > 500
 

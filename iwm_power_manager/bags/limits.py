@@ -1,0 +1,152 @@
+"""What a bag may ask of this machine: the limits of `docs/files.md` for bags, and nothing else decides them.
+
+Neither library has such limits: `rosbags` and `mcap` decompress whatever a frame says (`storage_mcap.decompress`,
+`stream_reader.get_chunk_data_stream`), and a file of kilobytes may say gigabytes.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+import stat
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from iwm_power_manager.errors import BagError
+
+_MEBIBYTE = 1024 * 1024
+
+#: One chunk, or one compressed message, uncompressed.
+MAX_CHUNK_BYTES = 256 * _MEBIBYTE
+#: What is decompressed, by what it was decompressed from; small things may be more.
+MAX_RATIO = 1000
+FREE_BYTES = 16 * _MEBIBYTE
+#: Chunks that overlap in time are in memory together.
+MAX_OVERLAP_BYTES = 1024 * _MEBIBYTE
+#: Records at the top of one file, and channels in it.
+MAX_RECORDS = 20_000_000
+MAX_CHANNELS = 10_000
+#: `metadata.yaml`, the same text inside of a file, and one profile of quality of service.
+MAX_METADATA_BYTES = 4 * _MEBIBYTE
+MAX_QOS_BYTES = 64 * 1024
+#: Instructions of sqlite's machine: a start, and more for each byte of the file.
+SQLITE_INSTRUCTIONS = 100_000_000
+SQLITE_INSTRUCTIONS_PER_BYTE = 100
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+
+def regular_file(path: Path, folder: Path | None = None) -> int:
+    """Size of a regular file; with `folder` one that lies in it.
+
+    Raises
+    ------
+    BagError
+        It is missing, a device, a pipe, a folder, or a link that leads out of the folder.
+    """
+    try:
+        status = path.stat()
+        if folder is not None and not path.resolve().is_relative_to(folder.resolve()):
+            raise BagError(f"{path}: leads out of the bag")
+    except (OSError, ValueError, RuntimeError) as error:  # the latter for names no file can have, and circles of links
+        raise BagError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise BagError(f"{path}: is no regular file")
+    return status.st_size
+
+
+def decompress(compression: str, data: bytes, size: int | None = None) -> bytes:
+    """A chunk's or a message's bytes.
+
+    Parameters
+    ----------
+    compression : "", "zstd" or "lz4"
+    data : compressed
+    size : uncompressed, as the file says; None if it does not
+
+    Raises
+    ------
+    BagError
+        It is damaged, of another size, or too large.
+    """
+    most = min(MAX_CHUNK_BYTES, FREE_BYTES + MAX_RATIO * len(data))
+    if size is not None and size > most:
+        raise BagError(f"{len(data)} bytes say they hold {size}; allowed: <= {most}")
+    raw = _decompressed(compression, data, most + 1 if size is None else size + 1)
+    if len(raw) > most:
+        raise BagError(f"{len(data)} bytes hold more than {most}")
+    if (len(raw) != size) if size is not None else not raw:
+        raise BagError("cannot be decompressed")
+    return raw
+
+
+def _decompressed(compression: str, data: bytes, most: int) -> bytes:
+    if compression == "":
+        return data[:most]
+    if compression == "zstd":
+        return _unzstd(data, most)
+    if compression == "lz4":
+        import lz4.frame
+
+        try:
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most))
+        except (RuntimeError, EOFError, MemoryError):
+            raise BagError("cannot be decompressed") from None
+    raise BagError(f"is compressed with {compression!r}; known: zstd, lz4")
+
+
+def _unzstd(data: bytes, most: int) -> bytes:
+    import zstandard
+
+    context = _zstd()
+    try:
+        if 0 <= zstandard.frame_content_size(data) < most:
+            return bytes(context.decompress(data))  # allocates what the frame says, which is allowed
+        with context.stream_reader(io.BytesIO(data), read_across_frames=True) as reader:
+            pieces: list[bytes] = []
+            left = most
+            while left > 0 and (piece := reader.read(min(left, 1 << 20))):
+                pieces.append(piece)
+                left -= len(piece)
+            return b"".join(pieces)
+    except (zstandard.ZstdError, MemoryError):
+        raise BagError("cannot be decompressed") from None
+
+
+@lru_cache(maxsize=1)
+def _zstd() -> Any:
+    import zstandard
+
+    return zstandard.ZstdDecompressor(max_window_size=1 << 27)
+
+
+def decompress_file(path: Path, target: Path) -> str:
+    """Decompress a `.zstd` file to the disk as far as it goes; returns what is wrong with it, "" for nothing.
+
+    Raises
+    ------
+    BagError
+        It holds more than its size, or the disk, allows.
+    """
+    import zstandard
+
+    size = regular_file(path)
+    most = min(FREE_BYTES + MAX_RATIO * size, shutil.disk_usage(target.parent).free // 2)
+    written = 0
+    try:
+        with (
+            path.open("rb") as source,
+            target.open("xb") as sink,
+            _zstd().stream_reader(source, read_across_frames=True) as reader,
+        ):
+            while piece := reader.read(1 << 20):
+                written += len(piece)
+                if written > most:
+                    raise BagError(f"{path}: holds more than {most} bytes, from {size}")
+                sink.write(piece)
+    except zstandard.ZstdError as error:
+        return f"is damaged: {error}"
+    except OSError as error:
+        raise BagError(f"{path}: cannot be decompressed: {error.strerror or error}") from None
+    return "" if written else "holds nothing"
