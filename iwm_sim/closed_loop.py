@@ -15,10 +15,10 @@ import numpy.typing as npt
 from iwm_power_manager.control import law
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.table import PolicyTable
-from iwm_power_manager.control.types import ControllerState, Measurement, initial_state
+from iwm_power_manager.control.types import Command, ControllerState, Measurement, initial_state
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.model.driver import DriverState, Trace, drive, sample
+from iwm_power_manager.model.driver import DriverState, Pedals, Trace, drive, sample
 from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.tyre import slip_ratio
@@ -30,37 +30,57 @@ FloatArray = npt.NDArray[np.float64]
 #: Temperature the simulated battery reports, degC. The plant has no thermal model of the pack.
 BATTERY_TEMPERATURE_DEGC = 25.0
 
-#: Columns of a run's series. Rows are taken at the start of a step; torques are what the plant did in that step.
-COLUMNS = (
-    "time_s",
-    "trace_mps",
-    "speed_mps",
-    "power_demand_w",
-    "accelerator",
-    "brake",
-    "decided_share",
-    "front_share",
-    "gate",
-    "limits",
-    "front_power_w",
-    "rear_power_w",
-    "front_motor_nm",
-    "rear_motor_nm",
-    "front_friction_nm",
-    "rear_friction_nm",
-    "front_wheel_radps",
-    "rear_wheel_radps",
-    "front_slip",
-    "rear_slip",
-    "soc",
-    "electrical_power_w",
-    "current_a",
-    "distance_m",
-    "acceleration_mps2",
-    "front_heat",
-    "rear_heat",
-    "chemical_j",
-)
+
+class Decision(NamedTuple):
+    """What only the control law knows of a step; fields as in `control.types.Command`."""
+
+    decided_share: float
+    front_share: float
+    gate: float
+    limits: float
+    front_power_w: float
+    rear_power_w: float
+
+
+class Row(NamedTuple):
+    """One step of a run, taken at its start; torques, power and acceleration are what the plant did in that step.
+
+    Wheel speeds, torques, slips and heat are those of the left wheel of each axle: on a straight, uniform road left and
+    right are alike. Roads where they are not have `iwm_sim.drive.RoadRow` beside it.
+    """
+
+    time_s: float
+    trace_mps: float
+    speed_mps: float
+    power_demand_w: float
+    accelerator: float
+    brake: float
+    decided_share: float
+    front_share: float
+    gate: float
+    limits: float
+    front_power_w: float
+    rear_power_w: float
+    front_motor_nm: float
+    rear_motor_nm: float
+    front_friction_nm: float
+    rear_friction_nm: float
+    front_wheel_radps: float
+    rear_wheel_radps: float
+    front_slip: float
+    rear_slip: float
+    soc: float
+    electrical_power_w: float
+    current_a: float
+    distance_m: float
+    acceleration_mps2: float
+    front_heat: float
+    rear_heat: float
+    chemical_j: float
+
+
+#: Columns of a run's series.
+COLUMNS = Row._fields
 
 
 class Noise(NamedTuple):
@@ -176,6 +196,65 @@ def measure(
 
 
 @kernel
+def decision_of(command: Command) -> Decision:
+    """What a command says of the law's reasons, as numbers of a row."""
+    return Decision(
+        decided_share=command.decided_share,
+        front_share=command.front_share,
+        gate=float(command.gate),
+        limits=float(command.limits),
+        front_power_w=command.front_power_w,
+        rear_power_w=command.rear_power_w,
+    )
+
+
+@kernel
+def row_of(
+    time_s: float,
+    trace_mps: float,
+    pedals: Pedals,
+    decision: Decision,
+    before: plant.PlantState,
+    after: plant.PlantState,
+    vehicle: VehicleParams,
+) -> Row:
+    """The row of a step from the car before and after it."""
+    front, rear = vehicle.front, vehicle.rear
+    speed = before.speed_mps
+    front_wheel, rear_wheel = before.wheel_speed_radps[0], before.wheel_speed_radps[2]
+    return Row(
+        time_s=time_s,
+        trace_mps=trace_mps,
+        speed_mps=speed,
+        power_demand_w=pedals.power_demand_w,
+        accelerator=pedals.accelerator,
+        brake=pedals.brake,
+        decided_share=decision.decided_share,
+        front_share=decision.front_share,
+        gate=decision.gate,
+        limits=decision.limits,
+        front_power_w=decision.front_power_w,
+        rear_power_w=decision.rear_power_w,
+        front_motor_nm=after.motor_torque_nm[0],
+        rear_motor_nm=after.motor_torque_nm[2],
+        front_friction_nm=after.friction_torque_nm[0],
+        rear_friction_nm=after.friction_torque_nm[2],
+        front_wheel_radps=front_wheel,
+        rear_wheel_radps=rear_wheel,
+        front_slip=slip_ratio(front_wheel, speed, front.wheel.radius_m, front.tyre.slip_speed_floor_mps),
+        rear_slip=slip_ratio(rear_wheel, speed, rear.wheel.radius_m, rear.tyre.slip_speed_floor_mps),
+        soc=before.soc,
+        electrical_power_w=after.electrical_power_w,
+        current_a=after.current_a,
+        distance_m=before.distance_m,
+        acceleration_mps2=after.acceleration_mps2,
+        front_heat=after.heat[0],
+        rear_heat=after.heat[2],
+        chemical_j=after.energies.chemical_j,
+    )
+
+
+@kernel
 def _loop(
     trace: Trace,
     car: plant.PlantState,
@@ -193,8 +272,6 @@ def _loop(
 ) -> plant.PlantState:
     road = (friction, friction, friction, friction)
     foot = DriverState(0.0)
-    radius = truth.front.wheel.radius_m
-    floor = truth.front.tyre.slip_speed_floor_mps
     for k in range(trace.speed_mps.size):
         speed_error = 0.0
         wheel_error = (0.0, 0.0, 0.0, 0.0)
@@ -215,36 +292,11 @@ def _loop(
         measurement = measure(car, pedals.power_demand_w, dt_s, assumed_friction, speed_error, wheel_error, vehicle)
         command, controller = law.step(measurement, controller, settings, vehicle, policy)
         before = car
+        surroundings = plant.Surroundings(road, trace.grade[k], 0.0)
         car = plant.advance(
-            car, command.motor_torque_nm, command.friction_torque_nm, trace.grade[k], road, dt_s, substeps, truth
+            car, command.motor_torque_nm, command.friction_torque_nm, 0.0, surroundings, dt_s, substeps, truth
         )
-        row = series[k]
-        row[0] = k * dt_s
-        row[1] = trace.speed_mps[k]
-        row[2] = before.speed_mps
-        row[3] = pedals.power_demand_w
-        row[4] = pedals.accelerator
-        row[5] = pedals.brake
-        row[6] = command.decided_share
-        row[7] = command.front_share
-        row[8] = command.gate
-        row[9] = command.limits
-        row[10] = command.front_power_w
-        row[11] = command.rear_power_w
-        row[12] = car.motor_torque_nm[0]
-        row[13] = car.motor_torque_nm[2]
-        row[14] = car.friction_torque_nm[0]
-        row[15] = car.friction_torque_nm[2]
-        row[16] = before.wheel_speed_radps[0]
-        row[17] = before.wheel_speed_radps[2]
-        row[18] = slip_ratio(before.wheel_speed_radps[0], before.speed_mps, radius, floor)
-        row[19] = slip_ratio(before.wheel_speed_radps[2], before.speed_mps, radius, floor)
-        row[20] = before.soc
-        row[21] = car.electrical_power_w
-        row[22] = car.current_a
-        row[23] = before.distance_m
-        row[24] = car.acceleration_mps2
-        row[25] = car.heat[0]
-        row[26] = car.heat[2]
-        row[27] = car.energies.chemical_j
+        row = row_of(k * dt_s, trace.speed_mps[k], pedals, decision_of(command), before, car, truth)
+        for column in range(len(row)):
+            series[k, column] = row[column]
     return car

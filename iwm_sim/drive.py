@@ -22,15 +22,14 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write, read_bytes
 from iwm_power_manager.model.driver import DriverState, Pedals, drive, sample
 from iwm_power_manager.model.pedals import full_braking_w
-from iwm_power_manager.model.tyre import slip_ratio
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import plant
-from iwm_sim.closed_loop import COLUMNS, Run
+from iwm_sim.closed_loop import COLUMNS, Decision, Run, row_of
 
 #: Columns of a run's series that only the control law knows; a drive leaves them empty (NaN).
-LAW_COLUMNS = ("decided_share", "front_share", "gate", "limits", "front_power_w", "rear_power_w")
+LAW_COLUMNS = Decision._fields
 CAR_COLUMNS = tuple(name for name in COLUMNS if name not in LAW_COLUMNS)
-_CAR_INDICES = [COLUMNS.index(name) for name in CAR_COLUMNS]
+_UNDECIDED = Decision(*(math.nan for _ in LAW_COLUMNS))
 
 
 class Sensors(NamedTuple):
@@ -152,37 +151,14 @@ class Drive:
             before,
             motor_torque_nm,
             friction_torque_nm,
-            self._trace.grade[k],
-            self._road,
+            0.0,
+            plant.Surroundings(self._road, self._trace.grade[k], 0.0),
             self._dt_s,
             self._substeps,
             self._params,
         )
-        radius, floor = self._params.front.wheel.radius_m, self._params.front.tyre.slip_speed_floor_mps
-        front_wheel, rear_wheel = before.wheel_speed_radps[0], before.wheel_speed_radps[2]
-        self._series[k, _CAR_INDICES] = (
-            k * self._dt_s,
-            self._trace.speed_mps[k],
-            before.speed_mps,
-            pedals.power_demand_w,
-            pedals.accelerator,
-            pedals.brake,
-            car.motor_torque_nm[0],
-            car.motor_torque_nm[2],
-            car.friction_torque_nm[0],
-            car.friction_torque_nm[2],
-            front_wheel,
-            rear_wheel,
-            slip_ratio(front_wheel, before.speed_mps, radius, floor),
-            slip_ratio(rear_wheel, before.speed_mps, radius, floor),
-            before.soc,
-            car.electrical_power_w,
-            car.current_a,
-            before.distance_m,
-            car.acceleration_mps2,
-            car.heat[0],
-            car.heat[2],
-            car.energies.chemical_j,
+        self._series[k] = row_of(
+            k * self._dt_s, self._trace.speed_mps[k], pedals, _UNDECIDED, before, car, self._params
         )
         self.step += 1
         self._pedals = None
@@ -268,7 +244,7 @@ def _rebuild(kind: type[plant.PlantState], leaves: Any) -> plant.PlantState:
     for name in kind._fields:
         if name == "energies":
             fields[name] = plant.Energies(*(next(leaves) for _ in plant.Energies._fields))
-        elif name in ("wheel_speed_radps", "heat", "motor_torque_nm", "friction_torque_nm"):
+        elif name in plant.OF_WHEELS:
             fields[name] = tuple(next(leaves) for _ in range(4))
         else:
             fields[name] = next(leaves)

@@ -1,14 +1,16 @@
 """The car as it is: the higher-fidelity model, used for evaluation only.
 
-Beyond the control-oriented model it has four wheels of their own, motors that heat up and derate, and a battery whose
-open-circuit voltage and resistance depend on its charge, with a polarisation branch. It obeys commands only as far as
-its motors can.
+Beyond the control-oriented model it moves in the plane (`iwm_sim.double_track`), forwards and backwards, and has four
+wheels of their own, motors that heat up and derate, and a battery whose open-circuit voltage and resistance depend on
+its charge, with a polarisation branch. It obeys commands only as far as its motors can. Where left and right are alike,
+nothing steers and the car rolls forwards, the motion in the plane is a straight line, and `model.longitudinal` solves
+it: the same equations without their lateral half.
 
 Every joule is booked. Within a step forces and torques are constant, so their work is exact with the mean of the speeds
 before and after, and
 
     chemical = ohmic + polarisation + motor losses + brakes + idle drag + tyre slip + air + rolling + grade
-               + change of kinetic energy (car and wheels) + change of energy in the polarisation branch
+               + change of kinetic energy (car and wheels, yaw included) + change of energy in the polarisation branch
 
 holds to rounding error.
 """
@@ -22,7 +24,7 @@ import numpy as np
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import current_a
-from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n
+from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n
 from iwm_power_manager.model.longitudinal import Four, step
 from iwm_power_manager.model.motor import (
     electrical_power_w,
@@ -31,7 +33,8 @@ from iwm_power_manager.model.motor import (
     regeneration_limit_nm,
     torque_limit_nm,
 )
-from iwm_power_manager.model.parameters import Battery, VehicleParams
+from iwm_power_manager.model.parameters import Axle, Battery, Motor, VehicleParams
+from iwm_sim import double_track
 
 
 class Energies(NamedTuple):
@@ -49,26 +52,49 @@ class Energies(NamedTuple):
     grade_j: float
 
 
+class Surroundings(NamedTuple):
+    """What the world does to the car in a step.
+
+    Attributes
+    ----------
+    friction : peak friction coefficient under each wheel
+    grade : rise over run
+    headwind_mps : wind against the car
+    """
+
+    friction: Four
+    grade: float = 0.0
+    headwind_mps: float = 0.0
+
+
 class PlantState(NamedTuple):
     """The car between two steps.
 
     Attributes
     ----------
-    speed_mps, wheel_speed_radps : car and four wheels
-    acceleration_mps2 : mean over the last step
-    distance_m : since the start
+    speed_mps, lateral_speed_mps, yaw_rate_radps : of the centre of gravity, in body axes: forward, to the left
+    wheel_speed_radps : four wheels, negative when rolling backwards
+    acceleration_mps2, lateral_acceleration_mps2 : mean over the last step
+    distance_m : since the start, along the car; backwards it falls
+    x_m, y_m, heading_rad : where it is, from a start at the origin; y and heading positive to the left
     soc : state of charge 0..1
     polarisation_v : voltage of the RC branch
     heat : heat index of each motor
-    motor_torque_nm, friction_torque_nm : what motors and brakes really did in the last step
+    motor_torque_nm, friction_torque_nm : what motors and brakes really did in the last step, forward positive
     electrical_power_w, current_a, terminal_v : battery in the last step
     energies : the books
     """
 
     speed_mps: float
+    lateral_speed_mps: float
+    yaw_rate_radps: float
     wheel_speed_radps: Four
     acceleration_mps2: float
+    lateral_acceleration_mps2: float
     distance_m: float
+    x_m: float
+    y_m: float
+    heading_rad: float
     soc: float
     polarisation_v: float
     heat: Four
@@ -80,15 +106,26 @@ class PlantState(NamedTuple):
     energies: Energies
 
 
+#: Fields of a `PlantState` that hold a number for each wheel.
+OF_WHEELS = ("wheel_speed_radps", "heat", "motor_torque_nm", "friction_torque_nm")
+
+
 def initial_plant(vehicle: VehicleParams, soc: float = 0.8, speed_mps: float = 0.0) -> PlantState:
     """A rested, cold car at a speed, its wheels rolling."""
     zero = (0.0, 0.0, 0.0, 0.0)
-    wheel = speed_mps / vehicle.front.wheel.radius_m
+    front = speed_mps / vehicle.front.wheel.radius_m
+    rear = speed_mps / vehicle.rear.wheel.radius_m
     return PlantState(
         speed_mps=float(speed_mps),
-        wheel_speed_radps=(wheel, wheel, wheel, wheel),
+        lateral_speed_mps=0.0,
+        yaw_rate_radps=0.0,
+        wheel_speed_radps=(front, front, rear, rear),
         acceleration_mps2=0.0,
+        lateral_acceleration_mps2=0.0,
         distance_m=0.0,
+        x_m=0.0,
+        y_m=0.0,
+        heading_rad=0.0,
         soc=float(soc),
         polarisation_v=0.0,
         heat=zero,
@@ -97,7 +134,7 @@ def initial_plant(vehicle: VehicleParams, soc: float = 0.8, speed_mps: float = 0
         electrical_power_w=0.0,
         current_a=0.0,
         terminal_v=float(open_circuit_v(float(soc), vehicle.battery)),
-        energies=Energies(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        energies=Energies(*(0.0 for _ in Energies._fields)),
     )
 
 
@@ -114,14 +151,55 @@ def ohmic_resistance_ohm(soc: float, battery: Battery) -> float:
     return battery.ohmic_resistance_ohm * (1.0 + rise)
 
 
+class Pack(NamedTuple):
+    """The battery over one step: its state afterwards, its power and what it lost."""
+
+    soc: float
+    polarisation_v: float
+    current_a: float
+    terminal_v: float
+    chemical_j: float
+    ohmic_j: float
+    polarisation_j: float
+
+
 @kernel
-def obeyed_torque_nm(
-    command_nm: float, wheel_speed_radps: float, speed_mps: float, heat: float, vehicle: VehicleParams
-) -> float:
-    """What a motor makes of a command: it saturates at its own limits."""
-    highest = torque_limit_nm(wheel_speed_radps, heat, vehicle.front.motor)
-    lowest = -regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, vehicle.front.motor)
-    return min(max(command_nm, lowest), highest)
+def pack_after(soc: float, polarisation_v: float, power_w: float, dt_s: float, battery: Battery) -> Pack:
+    """The battery after giving a power for a time."""
+    voltage = open_circuit_v(soc, battery)
+    resistance = ohmic_resistance_ohm(soc, battery)
+    current = current_a(power_w, voltage - polarisation_v, resistance)
+    # The RC branch exactly, for a current that holds through the step; its loss is what went in and did not stay.
+    decay = math.exp(-dt_s / battery.polarisation_time_constant_s)
+    full = battery.polarisation_resistance_ohm * current
+    after = full + (polarisation_v - full) * decay
+    capacity = 0.0
+    if battery.polarisation_resistance_ohm > 0.0:
+        capacity = battery.polarisation_time_constant_s / battery.polarisation_resistance_ohm
+    stored = 0.5 * capacity * (after * after - polarisation_v * polarisation_v)
+    entered = polarisation_v * current * dt_s
+    return Pack(
+        soc=soc - current * dt_s / (3600.0 * battery.capacity_ah),
+        polarisation_v=after,
+        current_a=current,
+        terminal_v=voltage - polarisation_v - resistance * current,
+        chemical_j=voltage * current * dt_s,
+        ohmic_j=resistance * current * current * dt_s,
+        polarisation_j=entered - stored,
+    )
+
+
+@kernel
+def obeyed_torque_nm(command_nm: float, wheel_speed_radps: float, speed_mps: float, heat: float, motor: Motor) -> float:
+    """What a motor makes of a command: it saturates at its own limits.
+
+    A torque against the car's way forwards is regeneration, with its limits; all others are the motor's full torque:
+    forwards whichever way the car rolls, backwards from rest on.
+    """
+    turning = abs(wheel_speed_radps)
+    most = torque_limit_nm(turning, heat, motor)
+    least = -regeneration_limit_nm(turning, speed_mps, heat, motor) if speed_mps > 0.0 else -most
+    return min(max(command_nm, least), most)
 
 
 @kernel
@@ -132,12 +210,228 @@ def _brake_part(held_nm: float, brake_nm: float, drag_nm: float) -> float:
 
 
 @kernel
+def _alike(of_wheels: Four) -> bool:
+    return of_wheels[0] == of_wheels[1] and of_wheels[2] == of_wheels[3]
+
+
+@kernel
+def runs_straight(
+    state: PlantState, motors: Four, resisting: Four, steer_rad: float, surroundings: Surroundings
+) -> bool:
+    """Whether nothing in this step can turn the car or drive it backwards."""
+    wheels = state.wheel_speed_radps
+    return (
+        steer_rad == 0.0
+        and state.lateral_speed_mps == 0.0
+        and state.yaw_rate_radps == 0.0
+        and surroundings.headwind_mps == 0.0
+        and state.speed_mps >= 0.0
+        and wheels[0] >= 0.0
+        and wheels[2] >= 0.0
+        and _alike(wheels)
+        and _alike(motors)
+        and _alike(resisting)
+        and _alike(surroundings.friction)
+        # At rest, a slope or a motor may start it backwards; what holds it then is Coulomb friction both ways.
+        and (state.speed_mps > 0.0 or (surroundings.grade == 0.0 and min(motors[0], motors[2]) >= 0.0))
+    )
+
+
+@kernel
+def _straight(
+    state: PlantState,
+    motors: Four,
+    resisting: Four,
+    surroundings: Surroundings,
+    dt_s: float,
+    vehicle: VehicleParams,
+) -> double_track.PlaneMotion:
+    """The step along a straight line, as motion in the plane."""
+    grade = surroundings.grade
+    motion = step(
+        state.speed_mps,
+        state.wheel_speed_radps,
+        state.acceleration_mps2,
+        motors,
+        resisting,
+        grade,
+        surroundings.friction,
+        dt_s,
+        vehicle,
+    )
+    mean_speed = 0.5 * (state.speed_mps + motion.speed_mps)
+    slipped = 0.0
+    for i in range(4):
+        radius = vehicle.front.wheel.radius_m if i < 2 else vehicle.rear.wheel.radius_m
+        mean_wheel = 0.5 * (state.wheel_speed_radps[i] + motion.wheel_speed_radps[i])
+        slipped += motion.tyre_force_n[i] * (radius * mean_wheel - mean_speed)
+    acceleration = (motion.speed_mps - state.speed_mps) / dt_s
+    front, rear = normal_forces_n(acceleration, motion.speed_mps, grade, vehicle.chassis)
+    held = motion.resisting_torque_nm
+    return double_track.PlaneMotion(
+        speed_mps=motion.speed_mps,
+        lateral_speed_mps=0.0,
+        yaw_rate_radps=0.0,
+        wheel_speed_radps=motion.wheel_speed_radps,
+        acceleration_mps2=acceleration,
+        lateral_acceleration_mps2=0.0,
+        normal_force_n=(front, front, rear, rear),
+        holding_torque_nm=(-held[0], -held[1], -held[2], -held[3]),
+        turned_rad=0.0,
+        mean_speed_mps=mean_speed,
+        mean_lateral_mps=0.0,
+        rolling_force_n=motion.rolling_force_n,
+        air_force_n=aerodynamic_force_n(motion.speed_mps, vehicle.chassis),
+        slip_work_w=slipped,
+    )
+
+
+@kernel
+def _moved(
+    state: PlantState,
+    motors: Four,
+    resisting: Four,
+    steer_rad: float,
+    surroundings: Surroundings,
+    dt_s: float,
+    vehicle: VehicleParams,
+) -> double_track.PlaneMotion:
+    """One implicit step of the motion, along a straight line where that is all it can be."""
+    if runs_straight(state, motors, resisting, steer_rad, surroundings):
+        motion = _straight(state, motors, resisting, surroundings, dt_s, vehicle)
+        if motion.speed_mps > 0.0 or surroundings.grade == 0.0:
+            return motion
+    return double_track.step(
+        state.speed_mps,
+        state.lateral_speed_mps,
+        state.yaw_rate_radps,
+        state.wheel_speed_radps,
+        state.acceleration_mps2,
+        state.lateral_acceleration_mps2,
+        motors,
+        resisting,
+        steer_rad,
+        surroundings.grade,
+        surroundings.headwind_mps,
+        surroundings.friction,
+        dt_s,
+        vehicle,
+    )
+
+
+@kernel
+def _wheel_work(
+    i: int, state: PlantState, motion: double_track.PlaneMotion, motors: Four, brakes: Four, drags: Four, motor: Motor
+) -> tuple[float, float, float, float, float]:
+    """One wheel over a step: electrical and shaft power, what brake and drag took (W), and the brake's torque (N m)."""
+    mean_wheel = 0.5 * (state.wheel_speed_radps[i] + motion.wheel_speed_radps[i])
+    held = motion.holding_torque_nm[i]
+    exerted = _brake_part(-held, brakes[i], drags[i])
+    # Running backwards, a motor does with both signs turned what it does forwards.
+    if mean_wheel < 0.0:
+        power = electrical_power_w(-motors[i], -mean_wheel, motor)
+    else:
+        power = electrical_power_w(motors[i], mean_wheel, motor)
+    return power, motors[i] * mean_wheel, exerted * mean_wheel, (-held - exerted) * mean_wheel, exerted
+
+
+@kernel
+def _substep(
+    state: PlantState,
+    motors: Four,
+    brakes: Four,
+    heat: Four,
+    steer_rad: float,
+    surroundings: Surroundings,
+    h: float,
+    vehicle: VehicleParams,
+) -> PlantState:
+    """One implicit step with its books; `heat` is the motors' afterwards."""
+    wheels = state.wheel_speed_radps
+    drags = (
+        idle_drag_nm(motors[0], abs(wheels[0]), vehicle.front.motor),
+        idle_drag_nm(motors[1], abs(wheels[1]), vehicle.front.motor),
+        idle_drag_nm(motors[2], abs(wheels[2]), vehicle.rear.motor),
+        idle_drag_nm(motors[3], abs(wheels[3]), vehicle.rear.motor),
+    )
+    resisting = (brakes[0] + drags[0], brakes[1] + drags[1], brakes[2] + drags[2], brakes[3] + drags[3])
+    motion = _moved(state, motors, resisting, steer_rad, surroundings, h, vehicle)
+    power = 0.0
+    shaft = 0.0
+    braked = 0.0
+    dragged = 0.0
+    for i in range(4):
+        motor = vehicle.front.motor if i < 2 else vehicle.rear.motor
+        electrical, mechanical, brake, drag, _ = _wheel_work(i, state, motion, motors, brakes, drags, motor)
+        power += electrical
+        shaft += mechanical
+        braked += brake
+        dragged += drag
+    pack = pack_after(state.soc, state.polarisation_v, power, h, vehicle.battery)
+    mean_speed = motion.mean_speed_mps
+    books = state.energies
+    heading = state.heading_rad + 0.5 * motion.turned_rad
+    # The mean velocity is given in the axes after the step; halfway through they point half a turn back.
+    back_cosine = math.cos(0.5 * motion.turned_rad)
+    back_sine = math.sin(0.5 * motion.turned_rad)
+    along = back_cosine * mean_speed - back_sine * motion.mean_lateral_mps
+    across = back_sine * mean_speed + back_cosine * motion.mean_lateral_mps
+    return PlantState(
+        speed_mps=motion.speed_mps,
+        lateral_speed_mps=motion.lateral_speed_mps,
+        yaw_rate_radps=motion.yaw_rate_radps,
+        wheel_speed_radps=motion.wheel_speed_radps,
+        acceleration_mps2=motion.acceleration_mps2,
+        lateral_acceleration_mps2=motion.lateral_acceleration_mps2,
+        distance_m=state.distance_m + mean_speed * h,
+        x_m=state.x_m + (math.cos(heading) * along - math.sin(heading) * across) * h,
+        y_m=state.y_m + (math.sin(heading) * along + math.cos(heading) * across) * h,
+        heading_rad=state.heading_rad + motion.turned_rad,
+        soc=pack.soc,
+        polarisation_v=pack.polarisation_v,
+        heat=heat,
+        motor_torque_nm=motors,
+        friction_torque_nm=(
+            -_brake_part(-motion.holding_torque_nm[0], brakes[0], drags[0]),
+            -_brake_part(-motion.holding_torque_nm[1], brakes[1], drags[1]),
+            -_brake_part(-motion.holding_torque_nm[2], brakes[2], drags[2]),
+            -_brake_part(-motion.holding_torque_nm[3], brakes[3], drags[3]),
+        ),
+        electrical_power_w=power,
+        current_a=pack.current_a,
+        terminal_v=pack.terminal_v,
+        energies=Energies(
+            chemical_j=books.chemical_j + pack.chemical_j,
+            ohmic_j=books.ohmic_j + pack.ohmic_j,
+            polarisation_j=books.polarisation_j + pack.polarisation_j,
+            motor_loss_j=books.motor_loss_j + (power - shaft) * h,
+            friction_brake_j=books.friction_brake_j + braked * h,
+            idle_drag_j=books.idle_drag_j + dragged * h,
+            tyre_slip_j=books.tyre_slip_j + motion.slip_work_w * h,
+            air_j=books.air_j + motion.air_force_n * mean_speed * h,
+            rolling_j=books.rolling_j + motion.rolling_force_n * mean_speed * h,
+            grade_j=books.grade_j + grade_force_n(surroundings.grade, vehicle.chassis) * mean_speed * h,
+        ),
+    )
+
+
+@kernel
+def _obeyed(i: int, command_nm: Four, state: PlantState, axle: Axle) -> float:
+    return obeyed_torque_nm(command_nm[i], state.wheel_speed_radps[i], state.speed_mps, state.heat[i], axle.motor)
+
+
+@kernel
+def _braking(command_nm: float, axle: Axle) -> float:
+    return min(max(-command_nm, 0.0), axle.friction_brake.max_torque_nm)
+
+
+@kernel
 def advance(
     state: PlantState,
     motor_command_nm: Four,
     friction_command_nm: Four,
-    grade: float,
-    friction: Four,
+    steer_rad: float,
+    surroundings: Surroundings,
     dt_s: float,
     substeps: int,
     vehicle: VehicleParams,
@@ -146,121 +440,33 @@ def advance(
 
     Parameters
     ----------
-    motor_command_nm, friction_command_nm : of each wheel; friction <= 0
-    grade : rise over run
-    friction : peak friction coefficient under each wheel
+    motor_command_nm, friction_command_nm : of each wheel; a friction torque <= 0 is how hard the brake is applied,
+        whichever way the wheel turns
+    steer_rad : angle of the front wheels, positive to the left
+    surroundings : road and wind
     dt_s : how long the command holds
     substeps : implicit steps it is divided into, >= 1
     """
-    battery = vehicle.battery
-    motor = vehicle.front.motor
-    radius = vehicle.front.wheel.radius_m
-    m0 = obeyed_torque_nm(motor_command_nm[0], state.wheel_speed_radps[0], state.speed_mps, state.heat[0], vehicle)
-    m1 = obeyed_torque_nm(motor_command_nm[1], state.wheel_speed_radps[1], state.speed_mps, state.heat[1], vehicle)
-    m2 = obeyed_torque_nm(motor_command_nm[2], state.wheel_speed_radps[2], state.speed_mps, state.heat[2], vehicle)
-    m3 = obeyed_torque_nm(motor_command_nm[3], state.wheel_speed_radps[3], state.speed_mps, state.heat[3], vehicle)
-    motors = (m0, m1, m2, m3)
-    most = vehicle.front.friction_brake.max_torque_nm
+    front = vehicle.front
+    rear = vehicle.rear
+    motors = (
+        _obeyed(0, motor_command_nm, state, front),
+        _obeyed(1, motor_command_nm, state, front),
+        _obeyed(2, motor_command_nm, state, rear),
+        _obeyed(3, motor_command_nm, state, rear),
+    )
     brakes = (
-        min(max(-friction_command_nm[0], 0.0), most),
-        min(max(-friction_command_nm[1], 0.0), most),
-        min(max(-friction_command_nm[2], 0.0), most),
-        min(max(-friction_command_nm[3], 0.0), most),
+        _braking(friction_command_nm[0], front),
+        _braking(friction_command_nm[1], front),
+        _braking(friction_command_nm[2], rear),
+        _braking(friction_command_nm[3], rear),
     )
-
-    h = dt_s / substeps
-    speed = state.speed_mps
-    wheels = state.wheel_speed_radps
-    acceleration = state.acceleration_mps2
-    distance = state.distance_m
-    soc = state.soc
-    polarisation = state.polarisation_v
-    books = state.energies
-    exerted = (0.0, 0.0, 0.0, 0.0)
-    power = 0.0
-    current = 0.0
-    terminal = 0.0
-    for _ in range(substeps):
-        drags = (
-            idle_drag_nm(m0, wheels[0], motor),
-            idle_drag_nm(m1, wheels[1], motor),
-            idle_drag_nm(m2, wheels[2], motor),
-            idle_drag_nm(m3, wheels[3], motor),
-        )
-        resisting = (brakes[0] + drags[0], brakes[1] + drags[1], brakes[2] + drags[2], brakes[3] + drags[3])
-        motion = step(speed, wheels, acceleration, motors, resisting, grade, friction, h, vehicle)
-        mean_speed = 0.5 * (speed + motion.speed_mps)
-
-        exerted = (
-            _brake_part(motion.resisting_torque_nm[0], brakes[0], drags[0]),
-            _brake_part(motion.resisting_torque_nm[1], brakes[1], drags[1]),
-            _brake_part(motion.resisting_torque_nm[2], brakes[2], drags[2]),
-            _brake_part(motion.resisting_torque_nm[3], brakes[3], drags[3]),
-        )
-        power = 0.0
-        shaft = 0.0
-        braked = 0.0
-        dragged = 0.0
-        slipped = 0.0
-        for i in range(4):
-            mean_wheel = 0.5 * (wheels[i] + motion.wheel_speed_radps[i])
-            power += electrical_power_w(motors[i], mean_wheel, motor)
-            shaft += motors[i] * mean_wheel
-            braked += exerted[i] * mean_wheel
-            dragged += (motion.resisting_torque_nm[i] - exerted[i]) * mean_wheel
-            slipped += motion.tyre_force_n[i] * (radius * mean_wheel - mean_speed)
-
-        voltage = open_circuit_v(soc, battery)
-        resistance = ohmic_resistance_ohm(soc, battery)
-        current = current_a(power, voltage - polarisation, resistance)
-        terminal = voltage - polarisation - resistance * current
-        soc -= current * h / (3600.0 * battery.capacity_ah)
-        # The RC branch exactly, for a current that holds through the step; its loss is what went in and did not stay.
-        decay = math.exp(-h / battery.polarisation_time_constant_s)
-        full = battery.polarisation_resistance_ohm * current
-        after = full + (polarisation - full) * decay
-        capacity = 0.0
-        if battery.polarisation_resistance_ohm > 0.0:
-            capacity = battery.polarisation_time_constant_s / battery.polarisation_resistance_ohm
-        stored = 0.5 * capacity * (after * after - polarisation * polarisation)
-        entered = polarisation * current * h
-        polarisation = after
-
-        books = Energies(
-            books.chemical_j + voltage * current * h,
-            books.ohmic_j + resistance * current * current * h,
-            books.polarisation_j + entered - stored,
-            books.motor_loss_j + (power - shaft) * h,
-            books.friction_brake_j + braked * h,
-            books.idle_drag_j + dragged * h,
-            books.tyre_slip_j + slipped * h,
-            books.air_j + aerodynamic_force_n(motion.speed_mps, vehicle.chassis) * mean_speed * h,
-            books.rolling_j + motion.rolling_force_n * mean_speed * h,
-            books.grade_j + grade_force_n(grade, vehicle.chassis) * mean_speed * h,
-        )
-        acceleration = (motion.speed_mps - speed) / h
-        distance += mean_speed * h
-        speed = motion.speed_mps
-        wheels = motion.wheel_speed_radps
-
     heat = (
-        heat_after(state.heat[0], m0, dt_s, motor),
-        heat_after(state.heat[1], m1, dt_s, motor),
-        heat_after(state.heat[2], m2, dt_s, motor),
-        heat_after(state.heat[3], m3, dt_s, motor),
+        heat_after(state.heat[0], motors[0], dt_s, front.motor),
+        heat_after(state.heat[1], motors[1], dt_s, front.motor),
+        heat_after(state.heat[2], motors[2], dt_s, rear.motor),
+        heat_after(state.heat[3], motors[3], dt_s, rear.motor),
     )
-    return PlantState(
-        speed,
-        wheels,
-        acceleration,
-        distance,
-        soc,
-        polarisation,
-        heat,
-        motors,
-        (-exerted[0], -exerted[1], -exerted[2], -exerted[3]),
-        power,
-        current,
-        terminal,
-        books,
-    )
+    for _ in range(substeps):
+        state = _substep(state, motors, brakes, heat, steer_rad, surroundings, dt_s / substeps, vehicle)
+    return state

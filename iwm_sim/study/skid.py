@@ -95,7 +95,7 @@ def emergency_stop(stop: Stop) -> Stopped:
     if stop.gate_mode == "table2":
         settings = settings._replace(gate_hysteresis=0.0, gate_driving=False)  # as printed
     table = cases.policy_of(stop.policy).table() if stop.policy else empty_table()
-    road = (stop.friction,) * 4
+    road = plant.Surroundings((stop.friction,) * 4)
     car = plant.initial_plant(params, 0.8, stop.from_mps)
     memory = initial_state()
     slips: list[list[float]] = []

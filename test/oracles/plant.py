@@ -44,7 +44,9 @@ def imbalance_j(before, after, vehicle):
     inertia, battery = vehicle.front.wheel.inertia_kgm2, vehicle.battery
 
     def stored(state):
-        kinetic = 0.5 * vehicle.chassis.mass_kg * state.speed_mps**2
+        chassis = vehicle.chassis
+        kinetic = 0.5 * chassis.mass_kg * (state.speed_mps**2 + state.lateral_speed_mps**2)
+        kinetic += 0.5 * chassis.yaw_inertia_kgm2 * state.yaw_rate_radps**2
         kinetic += sum(0.5 * inertia * w**2 for w in state.wheel_speed_radps)
         r1 = battery.polarisation_resistance_ohm
         return kinetic + (0.5 * battery.polarisation_time_constant_s / r1 * state.polarisation_v**2 if r1 else 0.0)

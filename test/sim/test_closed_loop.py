@@ -94,7 +94,8 @@ def test_stepping_the_kernels_from_python_gives_the_bits_of_the_compiled_loop():
         assert (row["decided_share"], row["front_share"]) == (command.decided_share, command.front_share)
         assert (row["gate"], row["limits"]) == (command.gate, command.limits)
         assert (row["front_power_w"], row["rear_power_w"]) == (command.front_power_w, command.rear_power_w)
-        car = plant.advance(car, command.motor_torque_nm, command.friction_torque_nm, at[3], (0.5,) * 4, dt, 2, params)
+        surroundings = plant.Surroundings((0.5,) * 4, at[3])
+        car = plant.advance(car, command.motor_torque_nm, command.friction_torque_nm, 0.0, surroundings, dt, 2, params)
         assert (row["electrical_power_w"], row["chemical_j"]) == (car.electrical_power_w, car.energies.chemical_j)
     assert car == compiled.final
     assert compiled["speed_mps"].max() > 11.0
@@ -144,7 +145,14 @@ def stop(friction, gate_mode):
         measurement = closed_loop.measure(car, demand, dt, friction, 0.0, (0.0,) * 4, params)
         command, state = law.step(measurement, state, settings, params, TABLE)
         car = plant.advance(
-            car, command.motor_torque_nm, command.friction_torque_nm, 0.0, (friction,) * 4, dt, 1, params
+            car,
+            command.motor_torque_nm,
+            command.friction_torque_nm,
+            0.0,
+            plant.Surroundings((friction,) * 4),
+            dt,
+            1,
+            params,
         )
         if car.speed_mps > 1.0:
             slips.append(

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
-from iwm_sim.plant import advance, initial_plant, obeyed_torque_nm, ohmic_resistance_ohm, open_circuit_v
+from iwm_sim.plant import (
+    Surroundings,
+    advance,
+    initial_plant,
+    obeyed_torque_nm,
+    ohmic_resistance_ohm,
+    open_circuit_v,
+)
 from oracles import physics
 from oracles import plant as oracle
 
@@ -33,9 +40,11 @@ def four(x):
     return (x, x, x, x)
 
 
-def hold(state, seconds, dt=0.01, motor=NOTHING, brake=NOTHING, grade=0.0, road=DRY, car=CAR, substeps=1):
+def hold(
+    state, seconds, dt=0.01, motor=NOTHING, brake=NOTHING, grade=0.0, road=DRY, car=CAR, substeps=1, steer=0.0, wind=0.0
+):
     for _ in range(round(seconds / dt)):
-        state = advance(state, motor, brake, grade, road, dt, substeps, car)
+        state = advance(state, motor, brake, steer, Surroundings(road, grade, wind), dt, substeps, car)
     return state
 
 
@@ -87,16 +96,18 @@ def test_a_pack_without_polarisation_is_a_source_behind_a_resistance():
 # --- Motors and brakes -----------------------------------------------------------------------------------------------
 
 
-@given(st.floats(-300.0, 300.0), st.floats(0.0, 150.0), st.floats(0.0, 40.0), st.floats(0.0, 1.2))
+@given(st.floats(-300.0, 300.0), st.floats(-150.0, 150.0), st.floats(-10.0, 40.0), st.floats(0.0, 1.2))
 def test_a_motor_obeys_as_far_as_it_can(command, wheel, speed, heat):
-    low = -physics.regeneration_limit(wheel, speed, heat, CAR.front.motor)
-    high = physics.torque_limit(wheel, heat, CAR.front.motor)
-    assert obeyed_torque_nm(command, wheel, speed, heat, CAR) == pytest.approx(min(max(command, low), high), abs=1e-9)
+    high = physics.torque_limit(abs(wheel), heat, CAR.front.motor)
+    low = -physics.regeneration_limit(abs(wheel), speed, heat, CAR.front.motor) if speed > 0.0 else -high
+    assert obeyed_torque_nm(command, wheel, speed, heat, CAR.front.motor) == pytest.approx(
+        min(max(command, low), high), abs=1e-9
+    )
 
 
 def test_a_motor_heats_up_by_the_square_of_its_torque():
-    state = hold(initial_plant(CAR), 45.0, 0.1, motor=(60.0, 60.0, 30.0, 0.0), brake=HELD)
-    expected = [(t / 80.0) ** 2 * (1.0 - math.exp(-0.5)) for t in (60.0, 60.0, 30.0, 0.0)]
+    state = hold(initial_plant(CAR), 45.0, 0.1, motor=(60.0, 50.0, 30.0, 0.0), brake=HELD)
+    expected = [(t / 80.0) ** 2 * (1.0 - math.exp(-0.5)) for t in (60.0, 50.0, 30.0, 0.0)]
     assert state.heat == pytest.approx(tuple(expected), rel=2e-3, abs=1e-12)
 
 
@@ -108,15 +119,17 @@ def test_a_hot_motor_derates_to_its_continuous_torque():
     assert cold.motor_torque_nm == four(200.0)
 
 
+def test_each_motor_is_held_back_by_its_own_heat():
+    heat = (1.0, 0.2, 0.6, 0.4)
+    state = hold(initial_plant(CAR)._replace(heat=heat), 0.01, motor=four(500.0), brake=HELD)
+    assert state.motor_torque_nm == pytest.approx(tuple(200.0 - 120.0 * h for h in heat))
+
+
 def test_brakes_only_brake_and_no_harder_than_they_can():
     start = initial_plant(CAR, 0.8, 20.0)
-    assert advance(start, NOTHING, four(50.0), 0.0, DRY, 0.01, 1, CAR).friction_torque_nm == NOTHING
-    assert advance(start, NOTHING, four(-5000.0), 0.0, DRY, 0.001, 1, CAR).friction_torque_nm == pytest.approx(
-        four(-900.0)
-    )
-    assert advance(start, NOTHING, four(-100.0), 0.0, DRY, 0.01, 1, CAR).friction_torque_nm == pytest.approx(
-        four(-100.0)
-    )
+    assert hold(start, 0.01, brake=four(50.0)).friction_torque_nm == NOTHING
+    assert hold(start, 0.001, 0.001, brake=four(-5000.0)).friction_torque_nm == pytest.approx(four(-900.0))
+    assert hold(start, 0.01, brake=four(-100.0)).friction_torque_nm == pytest.approx(four(-100.0))
 
 
 def test_idle_drives_drag_and_draw_what_they_are_set_to():
@@ -141,7 +154,7 @@ def test_what_brake_and_drag_take_from_a_wheel_that_stops_is_shared_as_told():
 
 
 def test_it_moves_as_scipy_says():
-    motors, brakes, grade, road = (60.0, 60.0, -40.0, -40.0), (0.0, 0.0, 80.0, 20.0), 0.02, (0.9, 0.5, 0.9, 0.5)
+    motors, brakes, grade, road = (60.0, 60.0, -40.0, -40.0), (0.0, 0.0, 80.0, 80.0), 0.02, (0.9, 0.9, 0.5, 0.5)
     start = initial_plant(CAR, 0.8, 15.0)
     state = hold(start, 0.5, 0.01, motors, tuple(-x for x in brakes), grade, road, substeps=20)
     speed, wheels = physics.dynamics(15.0, four(15.0 / RADIUS), motors, brakes, grade, road, 0.5, CAR)
@@ -152,7 +165,7 @@ def test_it_moves_as_scipy_says():
 
 def test_substeps_are_steps():
     start = initial_plant(CAR, 0.8, 10.0)
-    once = advance(start, four(50.0), NOTHING, 0.0, DRY, 0.02, 4, CAR)
+    once = hold(start, 0.02, 0.02, four(50.0), substeps=4)
     steps = hold(start, 0.02, 0.005, four(50.0))
     assert once._replace(heat=NOTHING) == steps._replace(heat=NOTHING)
     assert once.heat == pytest.approx(steps.heat, rel=1e-3)
@@ -171,7 +184,7 @@ def test_a_car_starts_rested_and_rolling():
 
 @settings(max_examples=50)
 @given(
-    speed=st.floats(0.0, 30.0),
+    speed=st.floats(-10.0, 30.0),
     commands=st.lists(
         st.tuples(
             st.tuples(*[st.floats(-100.0, 200.0)] * 4),
@@ -184,11 +197,13 @@ def test_a_car_starts_rested_and_rolling():
     road=st.tuples(*[st.sampled_from([0.9, 0.2])] * 4),
     dt=st.sampled_from([0.002, 0.01, 0.05]),
     car=st.sampled_from(list(CARS.values())),
+    steer=st.sampled_from([0.0, 0.05, -0.3]),
+    wind=st.sampled_from([0.0, 15.0, -15.0]),
 )
-def test_every_joule_is_accounted_for_whatever_happens(speed, commands, road, dt, car):
+def test_every_joule_is_accounted_for_whatever_happens(speed, commands, road, dt, car, steer, wind):
     start = state = initial_plant(car, 0.5, speed)
     for motor, brake, grade in commands:
-        state = hold(state, 5 * dt, dt, motor, brake, grade, road, car=car)
+        state = hold(state, 5 * dt, dt, motor, brake, grade, road, car=car, steer=steer, wind=wind)
     turnover = sum(map(abs, state.energies)) + 0.5 * car.chassis.mass_kg * speed**2
     assert oracle.imbalance_j(start, state, car) == pytest.approx(0.0, abs=1e-9 * turnover + 1e-9)
     assert min(state.energies.ohmic_j, state.energies.friction_brake_j, state.energies.idle_drag_j) >= -1e-9
