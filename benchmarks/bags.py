@@ -28,15 +28,16 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from iwm_power_manager.bags.definitions import definition_of, typestore
 from iwm_power_manager.bags.metadata import Qos, Topic
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.recording import Recording
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
-from iwm_power_manager.replay.plan import WHEEL_NAMES, Choice, make_plan
+from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.run import Replay, ReplayOutput
-from iwm_power_manager.signals.joint_state import JOINT_STATE, JointStateEncoder
-from iwm_power_manager.signals.mapping import load_mapping
+from iwm_power_manager.signals.contract import WHEEL_NAMES
+from iwm_power_manager.signals.definitions import definition_of, typestore
+from iwm_power_manager.signals.mapping import JOINT_STATE, load_mapping
+from iwm_power_manager.signals.readings import joint_state_writer
 
 TWIST, FLOAT64 = "geometry_msgs/msg/TwistStamped", "std_msgs/msg/Float64"
 TOPICS = 5
@@ -44,7 +45,7 @@ ROUNDS = 3
 #: Messages the recorder's node hands over at a time: 20 ms of 5 topics at 1 kHz.
 BATCH = 100
 MESSAGES = [
-    JointStateEncoder(WHEEL_NAMES, "effort")(i * 1_000_000, [math.sin(i + k) * 100.0 for k in range(4)])
+    joint_state_writer(WHEEL_NAMES, "effort")(i * 1_000_000, [math.sin(i + k) * 100.0 for k in range(4)])
     for i in range(1000)
 ]
 
@@ -251,7 +252,7 @@ def _write_inputs(path: Path, steps: int) -> None:
     types = typestore().types
     stamp_type, header_type = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
     vector, battery_type = types["geometry_msgs/msg/Vector3"], types["sensor_msgs/msg/BatteryState"]
-    wheels = JointStateEncoder(WHEEL_NAMES, "velocity")
+    wheels = joint_state_writer(WHEEL_NAMES, "velocity")
     cells = np.zeros(0, dtype=np.float32)
     kinds = {
         "/clock": "rosgraph_msgs/msg/Clock",

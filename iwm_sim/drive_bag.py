@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from iwm_power_manager.bags.definitions import typestore
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.errors import BagError
+from iwm_power_manager.signals.definitions import typestore
 from iwm_sim.closed_loop import COLUMNS, Run
 from iwm_sim.drive import LAW_COLUMNS
 

@@ -29,7 +29,7 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.mdp.demand import Source, chain_of
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.policy import Policy, load_policy
-from iwm_power_manager.signals.recorded import RecordedDrive
+from iwm_power_manager.replay.recorded import RecordedDrive
 from iwm_power_manager.solve import solve_one
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import closed_loop

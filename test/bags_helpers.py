@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from iwm_power_manager.bags.definitions import definition_of, typestore
 from iwm_power_manager.bags.metadata import Qos, Topic
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.controller import Controller, ControllerLimits
@@ -21,10 +20,12 @@ from iwm_power_manager.control.supervision import SupervisionLimits
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.policy import choose, load_policy_bank
 from iwm_power_manager.replay import steps
-from iwm_power_manager.replay.plan import WHEEL_NAMES
 from iwm_power_manager.replay.run import COMPUTED
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.joint_state import JOINT_STATE, JointStateEncoder
+from iwm_power_manager.signals.contract import WHEEL_NAMES
+from iwm_power_manager.signals.definitions import definition_of, typestore
+from iwm_power_manager.signals.mapping import JOINT_STATE
+from iwm_power_manager.signals.readings import joint_state_writer
 from iwm_power_manager.vehicle import load_vehicle
 
 FLOAT64 = "std_msgs/msg/Float64"
@@ -88,8 +89,8 @@ class ScriptedDrive:
         **custom_data: str,
     ) -> Path:
         """Drive `count` steps from step `start` on, starting the controller anew."""
-        wheel_states = JointStateEncoder(WHEEL_NAMES, "velocity")
-        torque, numbers = JointStateEncoder(WHEEL_NAMES, "effort"), JointStateEncoder(SIGNAL_NAMES, "position")
+        wheel_states = joint_state_writer(WHEEL_NAMES, "velocity")
+        torque, numbers = joint_state_writer(WHEEL_NAMES, "effort"), joint_state_writer(SIGNAL_NAMES, "position")
         custom_data["parameters /power_manager"] = json.dumps(self.parameters)
         with BagWriter(path, custom_data=custom_data) as bag:
             speed_topic = bag.add_topic(topic("/vehicle_speed", TWIST))

@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 from iwm_power_manager.control.settings import DEFAULTS, Settings
 from iwm_power_manager.control.supervision import Supervision
-from iwm_power_manager.control.types import Command, ControllerState, Measurement
+from iwm_power_manager.control.types import WHEEL_NAMES, Command, ControllerState, Measurement
 
-_WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 _SETTING = "setting."
 
 
@@ -28,7 +27,7 @@ _MEASUREMENT = (
     Signal("speed_mps", "vehicle speed the law used"),
     *(
         Signal(f"{wheel}_speed_radps", "wheel speed the law used; a lost wheel has its axle partner's")
-        for wheel in _WHEELS
+        for wheel in WHEEL_NAMES
     ),
     Signal("power_demand_w", "power demand the law used: after the ramps of the degraded state"),
     Signal("dt_s", "time since the previous step"),
@@ -38,8 +37,8 @@ _MEASUREMENT = (
     Signal("soc", "state of charge, 0..1"),
 )
 _COMMAND = (
-    *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in _WHEELS),
-    *(Signal(f"{wheel}_friction_torque_nm", "commanded friction brake torque, <= 0") for wheel in _WHEELS),
+    *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in WHEEL_NAMES),
+    *(Signal(f"{wheel}_friction_torque_nm", "commanded friction brake torque, <= 0") for wheel in WHEEL_NAMES),
     Signal("front_share", "front axle's part of the power demand as applied, 0..1"),
     Signal("decided_share", "front share the strategy decided on, 0..1"),
     Signal("gate", "axles held at zero torque: 0 none, 1 front, 2 rear, 3 both"),

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-Wheels = tuple[float, float, float, float]  # front_left, front_right, rear_left, rear_right
+Wheels = tuple[float, float, float, float]  # in the order of `WHEEL_NAMES`
+
+#: The wheels, in the order used everywhere.
+WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 
 #: Gate of a command: which axles are held at zero torque.
 GATE_NONE, GATE_FRONT, GATE_REAR, GATE_BOTH = range(4)

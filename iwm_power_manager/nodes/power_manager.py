@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,12 @@ from rclpy.parameter import Parameter
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64
 
 from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
 from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
+from iwm_power_manager.control.monitor import BatteryReading, InputMonitor, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.errors import BagError, ConfigError, IwmError
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.demand_log import DemandLog
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
@@ -42,31 +42,15 @@ from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
 from iwm_power_manager.share import resolve
-from iwm_power_manager.signals import live as quick
-from iwm_power_manager.vehicle import load_vehicle
+from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, DEMANDS, PEDALS, SignalMapping, Source, load_mapping
+from iwm_power_manager.signals.readings import Assembly, DemandReading, FrictionReading, TopicReader, topic_readers
+from iwm_power_manager.signals.types import Types, types_of
+from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
 _COMMANDS = (messages.WHEEL_TORQUE_COMMAND, messages.FRICTION_BRAKE_COMMAND)
-_INPUTS = (
-    messages.VEHICLE_SPEED,
-    messages.WHEEL_STATES,
-    messages.BATTERY_STATE,
-    messages.POWER_DEMAND,
-    messages.ROAD_FRICTION,
-)
-#: How they are read.
-_READERS: dict[str, Callable[[], quick.QuickReader[Any]]] = {
-    messages.VEHICLE_SPEED: quick.speed_reader,
-    messages.WHEEL_STATES: quick.wheel_reader,
-    messages.BATTERY_STATE: quick.battery_reader,
-    messages.POWER_DEMAND: quick.number_reader,
-    messages.ROAD_FRICTION: quick.number_reader,
-}
-#: The stamped inputs of a lock-step set, and their queue.
-_STAMPED = (
-    (SPEED, messages.VEHICLE_SPEED),
-    (WHEELS, messages.WHEEL_STATES),
-    (BATTERY, messages.BATTERY_STATE),
-)
+_OUTPUTS = (*_COMMANDS, messages.POWER_MANAGER_STATE)
+#: The queue of each stamped input of a lock-step set.
+_QUEUES: dict[type, int] = {SpeedReading: SPEED, JointReading: WHEELS, BatteryReading: BATTERY}
 #: How often, and how far apart, the rest of a set is looked for once its demand is there; later the watchdog looks.
 _SET_PATIENCE = 20
 _SET_POLL_S = 0.0002
@@ -116,7 +100,9 @@ class PowerManager(LifecycleNode):
         self._period_s = 1.0 / self._values["rate_hz"]
         self._last_step_ns: int | None = None
         self._last_step_steady_s = 0.0
-        self._answer: tuple[JointState, JointState, JointState] | None = None
+        self._answer: dict[str, JointState] | None = None
+        self._readers: dict[str, TopicReader] = {}
+        self._demand_reader: TopicReader | None = None
         # rclpy ends a transition that the present state does not have in an exception; its client would wait forever.
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._change_state_if_possible
@@ -241,6 +227,7 @@ class PowerManager(LifecycleNode):
             values["friction"],
         )
         self._policies = policies
+        self._readers = self._make_readers(vehicle)
         # The first call compiles the law or reads it from the cache: seconds that no control step may take.
         for table in policies.tables():
             self._controller.policy = table
@@ -255,6 +242,27 @@ class PowerManager(LifecycleNode):
             self.get_name(), self._wheel_names, None if self._lockstep else values["rate_hz"]
         )
 
+    def _make_readers(self, vehicle: Vehicle) -> dict[str, TopicReader]:
+        """A reader for each topic of the signals file, which can then be subscribed to."""
+        assert self._controller is not None
+        mapping = load_mapping(resolve(self._values["signals_file"]))
+        if self._values["signals_file"] == DEFAULT_MAPPING:
+            mapping = mapping.with_wheel_names(self._wheel_names)
+        monitor = self._controller.monitor
+        assembly = Assembly(self._wheel_names, vehicle.params, lambda: monitor.speed_mps)
+        types = {source.topic: self._types(mapping, source) for found in mapping.sources.values() for source in found}
+        return topic_readers(mapping, types, assembly)
+
+    def _types(self, mapping: SignalMapping, source: Source) -> Types:
+        """Types of a source, which have to be installed for DDS as well."""
+        if not source.type:
+            raise ConfigError(mapping.path, f"{source.key}.type", "is missing: a live signal needs it")
+        try:
+            messages.message_class(source.type)
+            return types_of(source.type)
+        except (ImportError, BagError) as error:
+            raise ConfigError(mapping.path, f"{source.key}.type", f"{source.type} cannot be used: {error}") from None
+
     def _create_entities(self) -> None:
         profile = qos.profile(lockstep=self._lockstep)
         overrides = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
@@ -262,20 +270,25 @@ class PowerManager(LifecycleNode):
         silent = {"event_callbacks": PublisherEventCallbacks(use_default_callbacks=False)}
         self._publishers_made = {
             topic: self.create_lifecycle_publisher(JointState, topic, profile, **overrides, **silent)
-            for topic in (*_COMMANDS, messages.POWER_MANAGER_STATE)
+            for topic in _OUTPUTS
         }
-        for topic in _INPUTS:
-            if topic != messages.POWER_DEMAND or not self._lockstep:
-                self._intake.subscribe(messages.TOPIC_TYPES[topic], topic, profile, _READERS[topic]())
-        if self._lockstep:
-            self._demand_subscription = self.create_subscription(
-                Float64,
-                messages.POWER_DEMAND,
-                self._on_demand,
-                profile,
-                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-                **overrides,
-            )
+        for topic, reader in self._readers.items():
+            kind = messages.message_class(reader.read.types.name)
+            reliability = "reliable" if "reliable" in {source.qos for source in reader.sources} else "best_effort"
+            asked = profile if self._lockstep else qos.profile(lockstep=False, reliability=reliability)
+            if self._lockstep and set(reader.signals).intersection((*DEMANDS, *PEDALS)):
+                self._demand_reader = reader
+                self._demand_subscription = self.create_subscription(
+                    kind,
+                    topic,
+                    self._on_demand,
+                    asked,
+                    event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+                    raw=True,
+                    **overrides,
+                )
+            else:
+                self._intake.subscribe(kind, topic, asked, raw=True)
 
     def _release(self) -> None:
         self._intake.close()
@@ -285,6 +298,8 @@ class PowerManager(LifecycleNode):
             self.destroy_lifecycle_publisher(publisher)
         self._demand_subscription = None
         self._publishers_made = {}
+        self._readers = {}
+        self._demand_reader = None
         self._controller = None
         self._policies = None
         if self._demand_log:
@@ -319,28 +334,33 @@ class PowerManager(LifecycleNode):
     def _take_inputs(self) -> None:
         """Real time: judge the newest message of every topic."""
         assert self._controller is not None
-        monitor, intake, now_ns = self._controller.monitor, self._intake, self._now_ns()
-        for reading, _ in intake.take(messages.VEHICLE_SPEED):
+        monitor, now_ns = self._controller.monitor, self._now_ns()
+        ahead_ns = now_ns - time.time_ns()  # of DDS, which tells when an unstamped message was sent
+        for topic, reader in self._readers.items():
+            for data, info in self._intake.take(topic):
+                for reading in reader(data, info["source_timestamp"] + ahead_ns):
+                    self._judge(monitor, reading, now_ns)
+
+    def _judge(self, monitor: InputMonitor, reading: Any, now_ns: int) -> None:
+        kind = type(reading)
+        if kind is SpeedReading:
             monitor.take_speed(reading, now_ns)
-        for reading, _ in intake.take(messages.WHEEL_STATES):
+        elif kind is JointReading:
             monitor.take_wheels(reading, now_ns)
-        for reading, _ in intake.take(messages.BATTERY_STATE):
+        elif kind is BatteryReading:
             monitor.take_battery(reading, now_ns)
-        for demand_w, info in intake.take(messages.POWER_DEMAND):
-            # No stamp of its own: how long ago DDS sent it is all there is to tell a late one by.
-            delay_s = (time.time_ns() - info["source_timestamp"]) / _NS_PER_S
-            monitor.take_demand(demand_w, delay_s, now_ns)
-        self._take_friction(now_ns)
+        elif kind is DemandReading:
+            monitor.take_demand(reading.power_w, (now_ns - reading.stamp_ns) / _NS_PER_S, now_ns)
+        elif kind is FrictionReading:
+            monitor.take_friction(reading.friction, now_ns)
 
-    def _take_friction(self, now_ns: int) -> None:
-        assert self._controller is not None
-        for friction, _ in self._intake.take(messages.ROAD_FRICTION):
-            self._controller.monitor.take_friction(friction, now_ns)
-
-    def _on_demand(self, message: Float64, info: dict[str, Any]) -> None:
+    def _on_demand(self, data: bytes, info: dict[str, Any]) -> None:
         """Lock-step: the demand closes a set."""
-        if self._active:
-            self._queue.push_demand(info["source_timestamp"], messages.read_number(message))
+        if self._active and self._demand_reader is not None:
+            sent_ns = info["source_timestamp"]
+            for reading in self._demand_reader(data, sent_ns):
+                if isinstance(reading, DemandReading):
+                    self._queue.push_demand(sent_ns, reading.power_w)
             # Topics are not ordered among each other: what was sent before may still be a moment away.
             for _ in range(_SET_PATIENCE):
                 self._collect_sets()
@@ -349,9 +369,15 @@ class PowerManager(LifecycleNode):
                 time.sleep(_SET_POLL_S)
 
     def _collect_sets(self) -> None:
-        for queue, topic in _STAMPED:
-            for reading, info in self._intake.take(topic):
-                self._queue.push(queue, reading.stamp_ns, info["source_timestamp"], reading)
+        assert self._controller is not None
+        for topic, reader in self._readers.items():
+            for data, info in self._intake.take(topic):
+                for reading in reader(data, info["source_timestamp"]):
+                    queue = _QUEUES.get(type(reading))
+                    if queue is not None:
+                        self._queue.push(queue, reading.stamp_ns, info["source_timestamp"], reading)
+                    else:
+                        self._judge(self._controller.monitor, reading, self._now_ns())
         self._step_complete_sets()
 
     # Steps
@@ -421,19 +447,22 @@ class PowerManager(LifecycleNode):
         except ControlFaultError as error:
             self.fail(str(error))
             return
-        self._answer = (
-            messages.torque_command_message(stamp_ns, self._wheel_names, command.motor_torque_nm),
-            messages.torque_command_message(stamp_ns, self._wheel_names, command.friction_torque_nm),
-            messages.named_numbers_message(stamp_ns, SIGNAL_NAMES, numbers),
-        )
+        names = self._wheel_names
+        self._answer = {
+            messages.WHEEL_TORQUE_COMMAND: messages.torque_command_message(stamp_ns, names, command.motor_torque_nm),
+            messages.FRICTION_BRAKE_COMMAND: messages.torque_command_message(
+                stamp_ns, names, command.friction_torque_nm
+            ),
+            messages.POWER_MANAGER_STATE: messages.named_numbers_message(stamp_ns, SIGNAL_NAMES, numbers),
+        }
         self._publish(self._answer)
         if self._demand_log:
             self._demand_log.note(stamp_ns, numbers)
         self._report.note_step(command, since_s, time.perf_counter() - started_s)
 
-    def _publish(self, answer: tuple[JointState, JointState, JointState]) -> None:
-        for publisher, message in zip(self._publishers_made.values(), answer, strict=True):
-            publisher.publish(message)
+    def _publish(self, answer: Mapping[str, JointState]) -> None:
+        for topic, message in answer.items():
+            self._publishers_made[topic].publish(message)
 
     def _command_zero(self) -> None:
         message = messages.torque_command_message(self._now_ns(), self._wheel_names, _ZERO)
@@ -491,7 +520,6 @@ class PowerManager(LifecycleNode):
         stepping = self._active and not self._lockstep
         if self._active and controller:
             if self._lockstep:
-                self._take_friction(self._now_ns())
                 self._collect_sets()
             self._choose_friction()
             standing_s = time.monotonic() - self._last_step_steady_s

@@ -12,6 +12,7 @@ from iwm_power_manager.control.settings import Change
 from iwm_power_manager.control.supervision import SupervisionLimits
 from iwm_power_manager.ros import messages
 from iwm_power_manager.ros.parameters import Spec, yaml_text
+from iwm_power_manager.signals.mapping import DEFAULT_MAPPING
 
 _INF = float("inf")
 
@@ -47,6 +48,11 @@ SPECS = (
         -1e5,
         1e5,
         length=4,
+    ),
+    Spec(
+        "signals_file",
+        DEFAULT_MAPPING,
+        "Signals YAML: which topic and field is which input, in which unit; path, or name among the package's files.",
     ),
     Spec(
         "fallback",

@@ -29,7 +29,6 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from iwm_power_manager import __version__
-from iwm_power_manager.bags.definitions import definition_of
 from iwm_power_manager.bags.mcap_file import COMPRESSIONS
 from iwm_power_manager.bags.metadata import Topic
 from iwm_power_manager.bags.recording import FAILED, Recording, RecordingOptions, Sample
@@ -54,6 +53,7 @@ from iwm_power_manager.ros.parameters import Change, ParameterError, Spec, decla
 from iwm_power_manager.ros.raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET, RawSubscriptions, Taken
 from iwm_power_manager.ros.remote_parameters import RemoteParameters
 from iwm_power_manager.share import resolve
+from iwm_power_manager.signals.types import definition_of
 
 DIAGNOSTICS = "/diagnostics"
 DEFAULT_TOPICS = [*TOPIC_TYPES, DIAGNOSTICS]

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from iwm_power_manager.mdp.demand import Source, signal_source
 from iwm_power_manager.mdp.problem import Problem
+from iwm_power_manager.replay.recorded import RecordedDrive, read_signal
 from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.mapping import load_mapping
-from iwm_power_manager.signals.recorded import RecordedDrive, read_signal
 from iwm_power_manager.vehicle import Vehicle
 
 

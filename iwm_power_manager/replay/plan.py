@@ -10,6 +10,7 @@ from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.settings import DEFAULTS, Settings
 from iwm_power_manager.control.strategies import STRATEGIES, name_of
 from iwm_power_manager.control.table import PolicyTable, empty_table
+from iwm_power_manager.control.types import WHEEL_NAMES
 from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.policy import Policy, choose, load_policy_bank
@@ -20,7 +21,6 @@ DEFAULT_VEHICLE = "config/vehicles/jalalmaab_2015.yaml"
 DEFAULT_POLICY = "policies"
 DEFAULT_FRICTION = 0.9
 DEFAULT_RATE_HZ = 100.0
-WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 
 _NODE = "/power_manager"
 _PARAMETERS = "parameters "

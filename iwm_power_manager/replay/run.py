@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from iwm_power_manager.bags.definitions import definition_of
 from iwm_power_manager.bags.metadata import Qos, Topic
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.writer import BagWriter
@@ -20,10 +19,11 @@ from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.errors import BagError, IwmError
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
 from iwm_power_manager.replay.plan import Plan
+from iwm_power_manager.replay.recorded import SignalStream, check_signals
 from iwm_power_manager.replay.steps import DECIDED_NAMES, ReconstructedSteps, RecordedSteps, ReplayedStep
-from iwm_power_manager.signals.joint_state import JOINT_STATE, JointStateDecoder, JointStateEncoder
-from iwm_power_manager.signals.mapping import SignalMapping, topic_named
-from iwm_power_manager.signals.recorded import SignalStream, check_signals
+from iwm_power_manager.signals.mapping import JOINT_STATE, SignalMapping, topic_named
+from iwm_power_manager.signals.readings import NamedValues, joint_state_reader, joint_state_writer
+from iwm_power_manager.signals.types import definition_of
 
 MOTOR_COMMAND = "wheel_torque_command"
 FRICTION_COMMAND = "friction_brake_command"
@@ -99,19 +99,19 @@ class Replay:
             kind: TopicComparer(name, tolerance) for kind, name in self._names.items() if name is not None
         }
         self._decoders = {
-            name: (kind, JointStateDecoder("position" if kind == STATE else "effort"))
+            name: (kind, joint_state_reader("position" if kind == STATE else "effort"))
             for kind, name in self._names.items()
             if name is not None
         }
         if self._state_topic is not None:
             self._recorded = RecordedSteps(plan)
         else:
-            self._stream = SignalStream(bag, mapping)
-            check_signals(bag, mapping, self._stream, plan.vehicle.params)
+            self._stream = SignalStream(bag, mapping, plan.vehicle.params)
+            check_signals(bag, mapping, self._stream)
             if "wheel_speed" not in self._stream.signals:
                 raise BagError(f"{bag.path}: holds no topic that {mapping.path} maps to wheel_speed")
             probe = itertools.islice(self._stream, 1000)
-            self._reconstructed = ReconstructedSteps(plan, self._stream.signals, probe)
+            self._reconstructed = ReconstructedSteps(plan, probe)
             self._stream.bad_messages = 0
 
     @property
@@ -162,7 +162,7 @@ class Replay:
         values = self._stream.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns)
         return self._reconstructed.take(values) if values else []
 
-    def _take_computed(self, message: Message, kind: str, decode: JointStateDecoder) -> list[ReplayedStep]:
+    def _take_computed(self, message: Message, kind: str, decode: Callable[[bytes], NamedValues]) -> list[ReplayedStep]:
         """A recorded command or state: what the recomputed one is held against, and where the state is, a step."""
         try:
             recorded = decode(message.data)
@@ -220,8 +220,8 @@ class ReplayOutput:
             name = topic_named(kind, bag.topics)
             topic = bag.topics[name] if name is not None else Topic(f"/{kind}", *_joint_state_type(), (Qos(depth=100),))
             self._numbers.append(writer.add_topic(topic))
-        self._wheels = JointStateEncoder(plan.wheel_names, "effort")
-        self._state = JointStateEncoder(SIGNAL_NAMES, "position")
+        self._wheels = joint_state_writer(plan.wheel_names, "effort")
+        self._state = joint_state_writer(SIGNAL_NAMES, "position")
 
     def write(self, message: Message, steps: Sequence[ReplayedStep]) -> None:
         """Write a message of the replayed bag, unless it is recomputed, and the steps it caused."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from iwm_power_manager.control import law, lockstep
 from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
@@ -25,15 +25,23 @@ from iwm_power_manager.control.monitor import (
 from iwm_power_manager.control.record import SIGNAL_NAMES, from_numbers
 from iwm_power_manager.control.supervision import SupervisionLimits
 from iwm_power_manager.control.types import Command, ControllerState, initial_state
-from iwm_power_manager.model.pedals import pedal_power_w
-from iwm_power_manager.replay.plan import WHEEL_NAMES, Plan
-from iwm_power_manager.signals.joint_state import NamedValues
-from iwm_power_manager.signals.recorded import SignalValue
+from iwm_power_manager.replay.plan import Plan
+from iwm_power_manager.replay.recorded import Recorded
+from iwm_power_manager.signals.contract import WHEEL_NAMES
+from iwm_power_manager.signals.readings import DemandReading, FrictionReading, NamedValues
 
 _NS_PER_S = 1_000_000_000
 _NAN = float("nan")
 _INF = float("inf")
 
+#: What each kind of reading is to the controller.
+_TOPICS = {
+    SpeedReading: SPEED,
+    JointReading: WHEELS,
+    BatteryReading: BATTERY,
+    DemandReading: DEMAND,
+    FrictionReading: FRICTION,
+}
 #: A pause in the recording longer than this starts the law anew.
 _PAUSE_S = 1.0
 #: Values from the start of a bag that show whether its messages come in sets of one stamp.
@@ -149,8 +157,7 @@ class ReconstructedSteps:
     Parameters
     ----------
     plan : car, policies, settings
-    signals : signals the bag holds
-    probe : values from its start
+    probe : readings from its start
 
     Attributes
     ----------
@@ -159,11 +166,10 @@ class ReconstructedSteps:
     faults : steps whose command no motor may be given
     """
 
-    def __init__(self, plan: Plan, signals: set[str], probe: Iterable[SignalValue]) -> None:
+    def __init__(self, plan: Plan, probe: Iterable[Recorded]) -> None:
         self.restarts = 0
         self.faults: Counter[str] = Counter()
         self._plan = plan
-        self._from_pedals = "power_demand" not in signals
         self.in_sets = _in_sets(probe)
         self._queue = lockstep.LockstepQueue()
         vehicle = plan.vehicle.params
@@ -172,10 +178,6 @@ class ReconstructedSteps:
         )
         table = plan.policies.table(plan.settings.strategy, plan.friction)
         self._controller = Controller(vehicle, WHEEL_NAMES, limits, plan.settings, table, plan.friction)
-        self._wheels = [_NAN] * 4
-        self._fresh = [False] * 4
-        self._pedals = [0.0, 0.0]
-        self._speed = 0.0
         self._last_ns: int | None = None
 
     @property
@@ -187,55 +189,18 @@ class ReconstructedSteps:
             if tally.dropped
         }
 
-    def take(self, values: Sequence[SignalValue]) -> list[ReplayedStep]:
-        """The values of one message; returns the steps they cause."""
-        by_signal = {value.signal: value for value in values}
-        ticks = []
-        for value in values:
-            reading = self._reading(value, by_signal)
-            if reading is not None:
-                topic, content, now_ns = reading
-                ticks.append((topic, content, now_ns, value))
+    def take(self, values: Sequence[Recorded]) -> list[ReplayedStep]:
+        """The readings of one message; returns the steps they cause."""
         steps = []
-        for topic, content, now_ns, value in ticks:
-            steps += (
-                self._push(topic, content, now_ns, value) if self.in_sets else self._use(topic, content, now_ns, value)
-            )
+        for value in values:
+            topic = _TOPICS.get(type(value.reading))
+            if topic is not None:
+                reading: Any = value.reading
+                content = reading[-1] if topic in (DEMAND, FRICTION) else reading
+                steps += (self._push if self.in_sets else self._use)(topic, content, reading.stamp_ns, value)
         return steps
 
-    def _reading(
-        self, value: SignalValue, message: dict[str, SignalValue]
-    ) -> tuple[str, SpeedReading | JointReading | BatteryReading | float, int] | None:
-        """What a value tells the controller, if it completes something."""
-        now_ns = value.log_time_ns if value.stamp_ns is None else value.stamp_ns
-        signal = value.signal
-        if signal == "speed":
-            self._speed = max(value.values[0], 0.0)
-            return SPEED, SpeedReading(now_ns, value.values[0]), now_ns
-        if signal == "wheel_speed":
-            if value.wheel >= 0:
-                self._wheels[value.wheel] = value.values[0]
-                self._fresh[value.wheel] = True
-                if not all(self._fresh):
-                    return None
-                self._fresh = [False] * 4
-                return WHEELS, JointReading(now_ns, WHEEL_NAMES, tuple(self._wheels)), now_ns
-            return WHEELS, JointReading(now_ns, WHEEL_NAMES, value.values), now_ns
-        if signal == "soc":
-            temperature = message.get("battery_temperature")
-            degrees = temperature.values[0] if temperature is not None else _NAN
-            return BATTERY, BatteryReading(now_ns, value.values[0], degrees, _NAN, _NAN), now_ns
-        if signal == "friction":
-            return FRICTION, value.values[0], now_ns
-        if signal == "power_demand":
-            return DEMAND, value.values[0], now_ns
-        if signal in ("accelerator_pedal", "brake_pedal") and self._from_pedals:
-            self._pedals[signal == "brake_pedal"] = min(max(value.values[0], 0.0), 1.0)
-            accelerator, brake = self._pedals
-            return DEMAND, float(pedal_power_w(accelerator, brake, self._speed, self._plan.vehicle.params)), now_ns
-        return None
-
-    def _push(self, topic: str, content: object, now_ns: int, value: SignalValue) -> list[ReplayedStep]:
+    def _push(self, topic: str, content: object, now_ns: int, value: Recorded) -> list[ReplayedStep]:
         """Lock-step: collect a set, step when it is complete."""
         queue = self._queue
         if topic == DEMAND:
@@ -259,7 +224,7 @@ class ReconstructedSteps:
             steps += self._step(stamp, self._plan.period_s if since_s is None else since_s, value)
         return steps
 
-    def _use(self, topic: str, content: object, now_ns: int, value: SignalValue) -> list[ReplayedStep]:
+    def _use(self, topic: str, content: object, now_ns: int, value: Recorded) -> list[ReplayedStep]:
         """Not in sets: keep the latest of everything, step at the wheel speeds."""
         monitor = self._controller.monitor
         if topic == SPEED:
@@ -300,7 +265,7 @@ class ReconstructedSteps:
         self._controller.reset()
         return None
 
-    def _step(self, stamp_ns: int, dt_s: float, value: SignalValue) -> list[ReplayedStep]:
+    def _step(self, stamp_ns: int, dt_s: float, value: Recorded) -> list[ReplayedStep]:
         self._last_ns = stamp_ns
         controller = self._controller
         before = controller.state
@@ -335,14 +300,14 @@ def decided(command: Command, before: ControllerState, after: ControllerState) -
     return dict(zip(DECIDED_NAMES, numbers, strict=True))
 
 
-def _in_sets(probe: Iterable[SignalValue]) -> bool:
+def _in_sets(probe: Iterable[Recorded]) -> bool:
     """Whether speed, wheel speeds and battery come with the same stamps, as in lock-step."""
-    stamps: dict[str, set[int]] = {"speed": set(), "wheel_speed": set(), "soc": set()}
+    stamps: dict[type, set[int]] = {SpeedReading: set(), JointReading: set(), BatteryReading: set()}
     for value in itertools.islice(probe, _PROBE_VALUES):
-        if value.signal in stamps:
-            if value.stamp_ns is None:
+        if type(value.reading) in stamps:
+            if not value.stamped:
                 return False
-            stamps[value.signal].add(value.stamp_ns)
+            stamps[type(value.reading)].add(value.reading.stamp_ns)
     common = set.intersection(*stamps.values())
     return len(common) > 1 and len(common) >= max(map(len, stamps.values())) - 2
 

@@ -18,10 +18,10 @@ from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.run import STATE, Replay
-from iwm_power_manager.signals.joint_state import JointStateDecoder
+from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.signals.mapping import SignalMapping, topic_named
+from iwm_power_manager.signals.readings import joint_state_reader
 
-_WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 _J_PER_WH = 3600.0
 
 
@@ -100,7 +100,7 @@ def what_if(
     state = topic_named(STATE, bag.topics)
     if state is not None and Replay(bag, plans[0][1], mapping).exact:
         meter = EnergyMeter("recorded", plans[0][1].vehicle.params)
-        decode = JointStateDecoder("position")
+        decode = joint_state_reader("position")
         for message in bag.messages():
             if message.topic == state:
                 values = dict(zip(*decode(message.data)[1:], strict=True))
@@ -121,5 +121,5 @@ def what_if(
 
 
 def _wheels(values: dict[str, float], kind: str) -> Wheels:
-    a, b, c, d = (values[f"{wheel}_{kind}"] for wheel in _WHEEL_NAMES)
+    a, b, c, d = (values[f"{wheel}_{kind}"] for wheel in WHEEL_NAMES)
     return a, b, c, d

@@ -7,7 +7,7 @@ loop either: of a queue of one, whatever comes between two steps overwrites itse
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
@@ -43,16 +43,14 @@ class Intake:
         self._node = node
         self._group = Unattended()
         self._subscriptions: dict[str, Any] = {}
-        self._readers: dict[str, Callable[[bytes], Any] | None] = {}
+        self._raw: dict[str, bool] = {}
 
-    def subscribe(
-        self, kind: type, topic: str, profile: QoSProfile, read: Callable[[bytes], Any] | None = None
-    ) -> None:
+    def subscribe(self, kind: type, topic: str, profile: QoSProfile, *, raw: bool = False) -> None:
         """Subscribe; the profile can be overridden by the node's `qos_overrides` parameters.
 
-        With `read`, `take` gives what it makes of a message's bytes instead of the message.
+        With `raw`, `take` gives a message's bytes instead of the message.
         """
-        self._readers[topic] = read
+        self._raw[topic] = raw
         self._subscriptions[topic] = self._node.create_subscription(
             kind,
             topic,
@@ -64,14 +62,16 @@ class Intake:
 
     def take(self, topic: str) -> Iterator[tuple[Any, dict[str, Any]]]:
         """Messages that have arrived since the last call, oldest first, each with its DDS information."""
-        subscription, read = self._subscriptions[topic], self._readers[topic]
+        subscription = self._subscriptions.get(topic)
+        if subscription is None:
+            return
         # A flood that arrives faster than it is taken must not hold the caller: one queue's worth at most.
         for _ in range(subscription.qos_profile.depth):
             with subscription.handle:
-                taken = subscription.handle.take_message(subscription.msg_type, read is not None)
+                taken = subscription.handle.take_message(subscription.msg_type, self._raw[topic])
             if taken is None:
                 return
-            yield (read(taken[0]), taken[1]) if read else taken
+            yield taken
 
     def drop_all(self) -> None:
         """Forget what has arrived on any topic."""
@@ -92,4 +92,4 @@ class Intake:
         for subscription in self._subscriptions.values():
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
-        self._readers.clear()
+        self._raw.clear()

@@ -7,6 +7,7 @@ and match by name, they do not judge the values: that is `control.inputs`. Sign 
 
 from __future__ import annotations
 
+import importlib
 import math
 from collections.abc import Sequence
 
@@ -16,39 +17,31 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 
-from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
-from iwm_power_manager.control.monitor import select_by_name as select_by_name  # part of this interface
+from iwm_power_manager.control.monitor import (
+    BatteryReading,
+    JointReading,
+    SpeedReading,
+)
+from iwm_power_manager.control.monitor import (
+    select_by_name as select_by_name,  # part of this interface
+)
+from iwm_power_manager.signals.contract import *  # noqa: F403 - names of topics and wheels: part of this interface
+from iwm_power_manager.signals.contract import TOPICS
 
-#: Default names of the wheels, in the order used everywhere (`control.types.Wheels`).
-WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 
-#: Topics, relative names, so that they can be remapped and live in the node's namespace.
-VEHICLE_SPEED = "vehicle_speed"
-WHEEL_STATES = "wheel_states"
-POWER_DEMAND = "power_demand"
-ACCELERATOR_PEDAL = "accelerator_pedal"
-BRAKE_PEDAL = "brake_pedal"
-BATTERY_STATE = "battery_state"
-ROAD_FRICTION = "road_friction"
-WHEEL_TORQUE_COMMAND = "wheel_torque_command"
-FRICTION_BRAKE_COMMAND = "friction_brake_command"
-POWER_MANAGER_STATE = "power_manager/state"
-CLOCK = "/clock"
+def message_class(msgtype: str) -> type:
+    """Class of a type such as `std_msgs/msg/Float64`; `ImportError` if it is not installed."""
+    package, _, rest = msgtype.partition("/")
+    kind, _, name = rest.partition("/")
+    try:
+        found: type = getattr(importlib.import_module(f"{package}.{kind}"), name)
+    except AttributeError:
+        raise ImportError(f"{msgtype} is not installed") from None
+    return found
+
 
 #: Message type of every topic.
-TOPIC_TYPES: dict[str, type] = {
-    VEHICLE_SPEED: TwistStamped,
-    WHEEL_STATES: JointState,
-    POWER_DEMAND: Float64,
-    ACCELERATOR_PEDAL: Float64,
-    BRAKE_PEDAL: Float64,
-    BATTERY_STATE: BatteryState,
-    ROAD_FRICTION: Float64,
-    WHEEL_TORQUE_COMMAND: JointState,
-    FRICTION_BRAKE_COMMAND: JointState,
-    POWER_MANAGER_STATE: JointState,
-    CLOCK: Clock,
-}
+TOPIC_TYPES: dict[str, type] = {topic.name: message_class(topic.type) for topic in TOPICS}
 
 _NANOSECONDS = 1_000_000_000
 

@@ -1,53 +1,82 @@
-"""Which topic and field of a bag is which signal, in which unit: read from YAML, applied to messages.
+"""Which topic and field is which signal, in which unit: one YAML for the live node and for bags.
 
     signals:
-      speed: {topic: /odom, field: twist.twist.linear.x, unit: km/h}
-      wheel_speed: {topic: /joint_states, field: velocity, unit: rpm, names: [fl, fr, rl, rr]}
-      power_demand: {topic: /demand, field: data, unit: kW, factor: -1}
+      speed: {topic: /odom, type: nav_msgs/msg/Odometry, field: twist.twist.linear.x, unit: km/h}
+      wheel_speed: {topic: /joint_states, type: sensor_msgs/msg/JointState, field: velocity, unit: rpm,
+                    names: [fl, fr, rl, rr], sign: [1, -1, 1, -1]}
+      power_demand: {topic: /demand, type: std_msgs/msg/Float64, field: data, unit: kW, factor: -1}
 
-Every signal ends up in SI units. The message types are those the bag itself describes, so that any type works whose
-definition it carries or ROS 2 Jazzy knows.
+Every signal ends up in SI units: value * factor * sign + offset, then the unit. A bag knows its own types, so that
+`type` may be left out there; live it is needed. docs/connect.md explains every key.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from iwm_power_manager.bags.definitions import learn_definition, typestore
-from iwm_power_manager.bags.metadata import Topic
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.files import check_choice, check_keys, check_number, dotted, read_yaml
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.cdr import number_reader
-from iwm_power_manager.signals.joint_state import JOINT_STATE, JointStateDecoder
 
-DEFAULT_MAPPING = "config/bags/project.yaml"
+DEFAULT_MAPPING = "config/signals/standard.yaml"
 
 WHEELS = 4
+#: A JointState, whose names stand in its field `name`.
+JOINT_STATE = "sensor_msgs/msg/JointState"
 
-#: Factor from each unit to the SI unit of the signal.
-_SPEED = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704}
-_ANGULAR_SPEED = {"rad/s": 1.0, "rpm": 2.0 * math.pi / 60.0, "deg/s": math.pi / 180.0, "rev/s": 2.0 * math.pi}
-_POWER = {"W": 1.0, "kW": 1e3}
-_RATIO = {"1": 1.0, "%": 0.01}
-_TEMPERATURE = {"degC": 1.0}
 
-_ARTICLES = {"number": "a number", "array": "an array", "message": "a message", "text": "a text", "": "nothing"}
+class Unit(NamedTuple):
+    """SI value = factor * value + offset; `rolling`: a speed of the rim, over the wheel's radius."""
 
-_UNITS: dict[str, dict[str, float]] = {
+    factor: float = 1.0
+    offset: float = 0.0
+    rolling: bool = False
+
+
+_G = 9.80665
+_SPEED = {"m/s": Unit(), "km/h": Unit(1.0 / 3.6), "mph": Unit(0.44704)}
+_TURNING = {
+    "rad/s": Unit(),
+    "rpm": Unit(2.0 * math.pi / 60.0),
+    "deg/s": Unit(math.pi / 180.0),
+    "rev/s": Unit(2.0 * math.pi),
+}
+_RIM = {name: unit._replace(rolling=True) for name, unit in _SPEED.items()}
+_RATIO = {"1": Unit(), "%": Unit(0.01)}
+_ACCELERATION = {"m/s2": Unit(), "g": Unit(_G)}
+
+#: Units of each signal.
+UNITS: dict[str, dict[str, Unit]] = {
     "speed": _SPEED,
-    "wheel_speed": _ANGULAR_SPEED,
-    "power_demand": _POWER,
+    "wheel_speed": _TURNING | _RIM,
+    "power_demand": {"W": Unit(), "kW": Unit(1e3)},
+    "force_demand": {"N": Unit(), "kN": Unit(1e3)},
+    "torque_demand": {"N m": Unit()},
+    "acceleration_demand": _ACCELERATION,
     "accelerator_pedal": _RATIO,
     "brake_pedal": _RATIO,
     "soc": _RATIO,
-    "battery_temperature": _TEMPERATURE,
+    "battery_temperature": {"degC": Unit(), "K": Unit(1.0, -273.15), "degF": Unit(5.0 / 9.0, -160.0 / 9.0)},
+    "battery_voltage": {"V": Unit()},
+    "battery_current": {"A": Unit()},
     "friction": _RATIO,
+    "yaw_rate": {name: _TURNING[name] for name in ("rad/s", "deg/s")},
+    "longitudinal_acceleration": _ACCELERATION,
+    "lateral_acceleration": _ACCELERATION,
+    "steering_angle": {"rad": Unit(), "deg": Unit(math.pi / 180.0)},
 }
-SIGNALS = tuple(_UNITS)
+SIGNALS = tuple(UNITS)
+PEDALS = ("accelerator_pedal", "brake_pedal")
+#: Ways to say what the driver wants; a live mapping has one of them, or both pedals.
+DEMANDS = ("power_demand", "force_demand", "torque_demand", "acceleration_demand")
+BATTERY = ("soc", "battery_temperature", "battery_voltage", "battery_current")
+MOTION = ("yaw_rate", "longitudinal_acceleration", "lateral_acceleration", "steering_angle")
+
+RELIABILITIES = ("best_effort", "reliable")
+STAMPS = ("header", "source")
 
 
 class Source(NamedTuple):
@@ -55,17 +84,30 @@ class Source(NamedTuple):
 
     Attributes
     ----------
+    key : where it stands in the file, for messages about it
     topic : full name, or without leading slash a name in any namespace
-    field : path of the number in the message, such as `twist.linear.x`
-    factor : from the number to SI units
+    field : path of the number in the message, such as `twist.linear.x` or `data[2]`
+    unit : of the value after `factor`, `signs` and `offset`
+    type : of the message; "" where the bag says it
+    factor, offset : applied in the message's unit
+    signs : +1 or -1 for each of four wheels; () for all +1
     names : of the four wheels in the order of this project, to be found in the message's field `name`; () if the field
         is a single number or an array in the right order
+    qos : "best_effort" or "reliable": what the live subscription asks for
+    stamp : "header" takes the header's stamp, if there is one; "source" the time DDS says it was sent
     """
 
+    key: str
     topic: str
     field: str
-    factor: float
+    unit: Unit
+    type: str = ""
+    factor: float = 1.0
+    offset: float = 0.0
+    signs: tuple[float, ...] = ()
     names: tuple[str, ...] = ()
+    qos: str = "best_effort"
+    stamp: str = "header"
 
 
 class SignalMapping(NamedTuple):
@@ -80,22 +122,14 @@ class SignalMapping(NamedTuple):
     path: Path
     sources: dict[str, tuple[Source, ...]]
 
+    def topics(self) -> list[str]:
+        """Topics as the file names them, each once."""
+        return list(dict.fromkeys(source.topic for sources in self.sources.values() for source in sources))
 
-class Extractor(NamedTuple):
-    """Turns the bytes of one topic's messages into values of a signal.
-
-    Attributes
-    ----------
-    signal : one of `SIGNALS`
-    wheel : which wheel the value is for; -1 for all four, or for a signal that has no wheels
-    read : values from a message of this topic, after deserialisation
-    quick : the same from its little-endian CDR bytes; None if there is no quick way
-    """
-
-    signal: str
-    wheel: int
-    read: Callable[[Any], tuple[float, ...]]
-    quick: Callable[[bytes], tuple[float, ...]] | None
+    def with_wheel_names(self, names: tuple[str, ...]) -> SignalMapping:
+        """The same with other names of the wheels, where wheels are found by name."""
+        wheels = tuple(s._replace(names=names) if s.names else s for s in self.sources.get("wheel_speed", ()))
+        return self._replace(sources=self.sources | ({"wheel_speed": wheels} if wheels else {}))
 
 
 def load_mapping(path: Path | str | None = None) -> SignalMapping:
@@ -115,28 +149,50 @@ def load_mapping(path: Path | str | None = None) -> SignalMapping:
         if signal == "wheel_speed" and isinstance(entry, list):
             if len(entry) != WHEELS:
                 raise ConfigError(file, key, f"{len(entry)} sources", "one for all wheels, or four")
-            sources[signal] = tuple(_source(file, f"{key}[{i}]", signal, item, False) for i, item in enumerate(entry))
+            sources[signal] = tuple(_source(file, f"{key}[{i}]", signal, item) for i, item in enumerate(entry))
         else:
-            sources[signal] = (_source(file, key, signal, entry, signal == "wheel_speed"),)
+            sources[signal] = (_source(file, key, signal, entry, wheels=signal == "wheel_speed"),)
     return SignalMapping(file, sources)
 
 
-def _source(file: Path, key: str, signal: str, entry: Any, wheels: bool) -> Source:
-    values = check_keys(file, entry, ["topic", "field", "unit"], ["factor", *(["names"] if wheels else [])], key)
-    for name in ("topic", "field"):
-        if not isinstance(values[name], str) or not values[name]:
+def _source(file: Path, key: str, signal: str, entry: Any, *, wheels: bool = False) -> Source:
+    optional = ["type", "factor", "offset", "sign", "qos", "stamp", *(["names"] if wheels else [])]
+    values = check_keys(file, entry, ["topic", "field", "unit"], optional, key)
+    for name in ("topic", "field", "type"):
+        if not isinstance(values.get(name, "x"), str) or not values.get(name, "x"):
             raise ConfigError(file, dotted(key, name), f"{values[name]!r} is no name")
-    units = _UNITS[signal]
+    units = UNITS[signal]
     unit = check_choice(file, dotted(key, "unit"), values["unit"], units)
+    sign = _signs(file, dotted(key, "sign"), values.get("sign", 1), wheels=wheels)
     factor = check_number(file, dotted(key, "factor"), values.get("factor", 1.0))
-    names = values.get("names", ())
-    if names and (
-        not isinstance(names, list) or len(set(map(str, names))) != WHEELS or not all(isinstance(n, str) for n in names)
-    ):
-        raise ConfigError(
-            file, dotted(key, "names"), f"{names!r} is not allowed", "four different names: fl, fr, rl, rr"
-        )
-    return Source(values["topic"], values["field"], factor * units[unit], tuple(names))
+    return Source(
+        key=key,
+        topic=values["topic"],
+        field=values["field"],
+        unit=units[unit],
+        type=values.get("type", ""),
+        factor=factor * sign[0] if len(set(sign)) == 1 else factor,
+        offset=check_number(file, dotted(key, "offset"), values.get("offset", 0.0)),
+        signs=sign if len(set(sign)) > 1 else (),
+        names=check_names(file, dotted(key, "names"), values["names"]) if "names" in values else (),
+        qos=check_choice(file, dotted(key, "qos"), values.get("qos", "best_effort"), RELIABILITIES),
+        stamp=check_choice(file, dotted(key, "stamp"), values.get("stamp", "header"), STAMPS),
+    )
+
+
+def check_names(file: Path, key: str, names: Any) -> tuple[str, ...]:
+    """Four different names of wheels; `ConfigError` for anything else."""
+    texts = isinstance(names, list) and all(isinstance(name, str) and name for name in names)
+    if texts and len(names) == len(set(names)) == WHEELS:
+        return tuple(names)
+    raise ConfigError(file, key, f"{names!r} is not allowed", "four different names: fl, fr, rl, rr")
+
+
+def _signs(file: Path, key: str, sign: Any, *, wheels: bool) -> tuple[float, ...]:
+    signs = sign if wheels and isinstance(sign, list) and len(sign) == WHEELS else [sign]
+    if any(isinstance(one, bool) or one not in (1, -1) for one in signs):
+        raise ConfigError(file, key, f"{sign!r} is not allowed", "1, -1" + (", or four of them" if wheels else ""))
+    return tuple(float(one) for one in signs)
 
 
 def topic_named(name: str, topics: Iterable[str]) -> str | None:
@@ -156,106 +212,3 @@ def topic_named(name: str, topics: Iterable[str]) -> str | None:
     if len(found) > 1:
         raise BagError(f"topic {name}: recorded in several namespaces: {', '.join(sorted(found))}; name one of them")
     return found[0] if found else None
-
-
-def extractors(mapping: SignalMapping, topics: Mapping[str, Topic]) -> dict[str, list[Extractor]]:
-    """For each recorded topic that carries a signal, how to read it.
-
-    Raises
-    ------
-    ConfigError
-        A field does not exist in the type of its topic, or is no number.
-    BagError
-        The definition of a type is nowhere to be found.
-    """
-    found: dict[str, list[Extractor]] = {}
-    for signal, sources in mapping.sources.items():
-        for wheel, source in enumerate(sources):
-            name = topic_named(source.topic, topics)
-            if name is None:
-                continue
-            topic = topics[name]
-            learn_definition(topic)
-            key = dotted("signals", signal)
-            all_wheels = signal == "wheel_speed" and len(sources) == 1
-            read = _reader(mapping.path, key, source, topic, all_wheels=all_wheels)
-            quick = _quick_wheels(source, topic) if all_wheels else _quick_number(source, topic)
-            found.setdefault(name, []).append(Extractor(signal, wheel if len(sources) > 1 else -1, read, quick))
-    return found
-
-
-def _reader(file: Path, key: str, source: Source, topic: Topic, all_wheels: bool) -> Callable[[Any], tuple[float, ...]]:
-    path = source.field.split(".")
-    kind = _field_kind(topic.type, path)
-    wanted = "array" if all_wheels else "number"
-    if kind != wanted:
-        problem = f"{topic.type} has no field {source.field}" if kind == "" else f"{source.field} is {_ARTICLES[kind]}"
-        raise ConfigError(file, dotted(key, "field"), problem, f"a field of {topic.type} that is {_ARTICLES[wanted]}")
-    factor, names = source.factor, source.names
-    if names and _field_kind(topic.type, [*path[:-1], "name"]) != "array":
-        raise ConfigError(file, dotted(key, "names"), f"{topic.type} has no field `name` beside {source.field}")
-    last = path[-1]
-
-    def parent(message: Any) -> Any:
-        for part in path[:-1]:
-            message = getattr(message, part)
-        return message
-
-    def number(message: Any) -> tuple[float, ...]:
-        return (factor * float(getattr(parent(message), last)),)
-
-    def in_order(message: Any) -> tuple[float, ...]:
-        values = getattr(parent(message), last)
-        if len(values) != WHEELS:
-            return (math.nan,) * WHEELS
-        return tuple(factor * float(value) for value in values)
-
-    def by_name(message: Any) -> tuple[float, ...]:
-        owner = parent(message)
-        values, present = getattr(owner, last), list(owner.name)
-        if len(values) != len(present):
-            return (math.nan,) * WHEELS
-        return tuple(
-            factor * float(values[present.index(name)]) if present.count(name) == 1 else math.nan for name in names
-        )
-
-    if not all_wheels:
-        return number
-    return by_name if names else in_order
-
-
-def _quick_number(source: Source, topic: Topic) -> Callable[[bytes], tuple[float, ...]] | None:
-    read = number_reader(topic.type, source.field.split("."))
-    factor = source.factor
-    return None if read is None else lambda data: (factor * float(read(data)),)
-
-
-def _quick_wheels(source: Source, topic: Topic) -> Callable[[bytes], tuple[float, ...]] | None:
-    if topic.type != JOINT_STATE or not source.names:
-        return None
-    decode, factor, wanted = JointStateDecoder(source.field), source.factor, source.names
-
-    def read(data: bytes) -> tuple[float, ...]:
-        _, names, values = decode(data)
-        if names == wanted:
-            return tuple(factor * value for value in values)
-        return tuple(factor * values[names.index(name)] if names.count(name) == 1 else math.nan for name in wanted)
-
-    return read
-
-
-def _field_kind(msgtype: str, path: list[str]) -> str:
-    """What a field is: "number", "array", "message", "text", or "" if it does not exist."""
-    from rosbags.interfaces import Nodetype
-
-    fields = dict(typestore().fielddefs[msgtype][1])
-    if path[0] not in fields:
-        return ""
-    kind, argument = fields[path[0]]
-    if kind == Nodetype.NAME:
-        return _field_kind(str(argument), path[1:]) if len(path) > 1 else "message"
-    if len(path) > 1:
-        return ""
-    if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        return "array"
-    return "text" if argument[0] in ("string", "wstring") else "number"

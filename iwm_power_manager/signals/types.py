@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+from contextlib import suppress
 from functools import lru_cache
 from itertools import chain
 from pathlib import Path
@@ -25,6 +26,10 @@ MSG, IDL = "ros2msg", "ros2idl"
 MAX_TEXT_BYTES = 256 * 1024
 MAX_DEPTH = 32
 MAX_FIELDS = 20_000
+
+_ENCAPSULATION = 4
+#: Bytes at the end of a message that may be padding.
+_MAX_PADDING = 16
 
 _SEPARATOR = "=" * 80
 #: How a text of wide characters may lie in CDR: DDS vendors and versions differ in the width and in what they count.
@@ -44,13 +49,20 @@ class Types(NamedTuple):
     name: str
 
     def deserialize(self, data: bytes) -> Any:
-        """Message from its CDR bytes; raises whatever a generated decoder makes of bytes that are no message."""
+        """Message from its CDR bytes; raises whatever a generated decoder makes of bytes that are no message.
+
+        What `rclpy.serialization` makes ends in some bytes of padding for each empty list (rmw_fastrtps takes the size
+        from an estimate that aligns them); rosbags allows three bytes too many.
+        """
+        for padding in range(0, min(_MAX_PADDING, len(data) - _ENCAPSULATION) + 1, 4):
+            with suppress(Exception):
+                return self.store.deserialize_cdr(data[: len(data) - padding], self.name)
         return self.store.deserialize_cdr(data, self.name)
 
     def fits(self, data: bytes) -> bool:
-        """Whether these bytes are a message of this type."""
+        """Whether these bytes are a message of this type, to the last byte."""
         try:
-            self.deserialize(data)
+            self.store.deserialize_cdr(data, self.name)
         except Exception:  # noqa: BLE001 - see `deserialize`
             return False
         return True

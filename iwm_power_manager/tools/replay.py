@@ -86,7 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     law.add_argument("--strategy", metavar="NAME", nargs="+", help=strategies)
     law.add_argument("--friction", type=float, metavar="MU", help="peak friction the strategy assumes")
     law.add_argument("--set", dest="settings", metavar="NAME=VALUE", action="append", default=[], help="a setting")
-    law.add_argument("--mapping", metavar="YAML", help="topics, fields and units of another car's bag (config/bags/)")
+    law.add_argument("--mapping", metavar="YAML", help="fields and units of another car's bag (config/signals/)")
     out = parser.add_argument_group("results")
     out.add_argument("--output", metavar="DIR", help="write a bag: inputs as recorded, commands recomputed")
     out.add_argument("--compare", action="store_true", help="recomputed against recorded; exit code 1 if they differ")

@@ -115,7 +115,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="NPZ",
         help="demand counted by the power manager (its parameter demand_log); repeat for more",
     )
-    demand.add_argument("--mapping", metavar="YAML", help="topics and units of foreign bags (config/bags/)")
+    demand.add_argument("--mapping", metavar="YAML", help="topics and units of foreign bags (config/signals/)")
     demand.add_argument(
         "--bag-weight",
         type=float,

@@ -90,7 +90,7 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument("--bag", action="append", required=True, metavar="BAG", help="recorded drive; repeat for more")
     result.add_argument("--friction", nargs="+", type=float, required=True, metavar="MU", help="one policy each")
     result.add_argument("--output", required=True, metavar="DIR|FILE", help="folder, or a .npz file for a single one")
-    result.add_argument("--mapping", metavar="YAML", help="topics and units of foreign bags (config/bags/)")
+    result.add_argument("--mapping", metavar="YAML", help="topics and units of foreign bags (config/signals/)")
     result.add_argument(
         "--cycle", action="append", metavar="CSV", help=f"cycles beside the bags (default: {', '.join(CYCLES)})"
     )

@@ -13,11 +13,11 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from bags_helpers import FLOAT64, float64, topic
-from iwm_power_manager.bags.definitions import typestore
 from iwm_power_manager.bags.metadata import parse_qos
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.errors import BagError
+from iwm_power_manager.signals.definitions import typestore
 
 
 def written_by_rosbags(

@@ -12,7 +12,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from bags_helpers import TWIST, ScriptedDrive, float64, topic, twist
-from iwm_power_manager.bags.definitions import typestore
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.settings import default_settings
@@ -23,6 +22,7 @@ from iwm_power_manager.replay.compare import TopicComparer
 from iwm_power_manager.replay.plan import Choice, make_plan, recorded_parameters
 from iwm_power_manager.replay.run import Replay
 from iwm_power_manager.share import share_path
+from iwm_power_manager.signals.definitions import typestore
 from iwm_power_manager.signals.mapping import load_mapping
 from iwm_power_manager.tools.replay import BAD_INPUT, DIFFERENT, DONE, main
 
@@ -309,11 +309,11 @@ def test_another_cars_bag_is_replayed_through_a_mapping(tmp_path: Path, capsys: 
 def test_a_pause_in_the_inputs_starts_the_law_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     script = ScriptedDrive(STRATEGY)
     with BagWriter(tmp_path / "bag") as bag:
-        from bags_helpers import JointStateEncoder
+        from bags_helpers import joint_state_writer
 
         speed, demand = bag.add_topic(topic("/vehicle_speed", TWIST)), bag.add_topic(topic("/power_demand"))
         wheels = bag.add_topic(topic("/wheel_states", "sensor_msgs/msg/JointState"))
-        encode = JointStateEncoder(("front_left", "front_right", "rear_left", "rear_right"), "velocity")
+        encode = joint_state_writer(("front_left", "front_right", "rear_left", "rear_right"), "velocity")
         for i in range(60):
             now = i * 10_000_000 + (5_000_000_000 if i >= 30 else 0)
             metres, radps, watts = script.inputs(i)
@@ -413,12 +413,12 @@ def test_a_replay_that_fails_leaves_nothing_in_the_way(drive: Path, tmp_path: Pa
 def test_a_bag_whose_inputs_never_come_together_gives_no_step(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from bags_helpers import JointStateEncoder
+    from bags_helpers import joint_state_writer
 
     with BagWriter(tmp_path / "bag") as bag:
         speed, demand = bag.add_topic(topic("/vehicle_speed", TWIST)), bag.add_topic(topic("/power_demand"))
         wheels = bag.add_topic(topic("/wheel_states", "sensor_msgs/msg/JointState"))
-        encode = JointStateEncoder(("front_left", "front_right", "rear_left", "rear_right"), "velocity")
+        encode = joint_state_writer(("front_left", "front_right", "rear_left", "rear_right"), "velocity")
         bag.write(wheels, 1, encode(1, (1.0, 1.0, 1.0, 1.0)))
         bag.write(speed, 2, twist(2, 1.0))
         bag.write(demand, 3, float64(1.0))
@@ -473,11 +473,11 @@ def test_a_comparison_tells_largest_rms_first_and_what_has_no_counterpart() -> N
 
 
 def test_a_state_of_another_version_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from bags_helpers import JointStateEncoder
+    from bags_helpers import joint_state_writer
 
     with BagWriter(tmp_path / "bag") as bag:
         number = bag.add_topic(topic("/power_manager/state", "sensor_msgs/msg/JointState"))
-        bag.write(number, 1, JointStateEncoder(("speed_mps",), "position")(1, (2.0,)))
+        bag.write(number, 1, joint_state_writer(("speed_mps",), "position")(1, (2.0,)))
     assert main([str(tmp_path / "bag"), "--compare"]) == BAD_INPUT
     assert "lacks the signal 'step': recorded by another version" in capsys.readouterr().err
 

@@ -57,8 +57,8 @@ def compiled_law() -> None:
     """Compile the law once, before processes are started that have to answer in time."""
     from iwm_power_manager.control import law
     from iwm_power_manager.control.settings import default_settings
+    from iwm_power_manager.control.table import empty_table
     from iwm_power_manager.control.types import Measurement, initial_state
-    from iwm_power_manager.policy import empty_table
     from iwm_power_manager.share import resolve
     from iwm_power_manager.vehicle import load_vehicle
 

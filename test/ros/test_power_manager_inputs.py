@@ -184,7 +184,7 @@ class TestDiagnostics:
         bench.drive(lambda: bench.status("command topics").level == DiagnosticStatus.OK, "quiet again")
 
     def test_a_publisher_with_weaker_quality_of_service_is_named(self, start_pair) -> None:
-        pair = start_pair({"autostart": True})
+        pair = start_pair({"qos_overrides.{namespace}/power_demand.subscription.reliability": "reliable"})
         bench = pair.bench
         strong = bench.publishers.pop(messages.POWER_DEMAND)
         bench.node.destroy_publisher(strong)

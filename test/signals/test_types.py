@@ -108,3 +108,14 @@ def test_a_definition_comes_with_what_it_depends_on() -> None:
     assert digest.startswith("RIHS01_")
     again = types_of("geometry_msgs/msg/TwistStamped", "ros2msg", text)
     assert again.store.hash_rihs01(again.name) == digest
+
+
+def test_padding_that_the_middleware_leaves_at_the_end_is_no_damage_but_more_is() -> None:
+    """`rclpy.serialization` leaves up to 12 bytes of whatever was in memory behind an empty JointState."""
+    kind = types_of("sensor_msgs/msg/JointState")
+    message = bytes.fromhex("000100000000000000000000010000000000000000000000000000000000000000000000")
+    for padding in (0, 4, 12, 19):
+        assert list(kind.deserialize(message + b"x" * padding).velocity) == []
+    for padding in (20, 100):
+        with pytest.raises(Exception, match="size mismatch"):
+            kind.deserialize(message + b"x" * padding)

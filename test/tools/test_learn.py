@@ -18,8 +18,8 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.mdp.demand import Source
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import load_policy
+from iwm_power_manager.replay.recorded import RecordedDrive
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.recorded import RecordedDrive
 from iwm_power_manager.tools import solve_policy
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import closed_loop, learning

@@ -15,8 +15,8 @@ from iwm_power_manager.mdp.demand import chain_of, cycle_power_w, cycle_source, 
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import load_policy, load_policy_bank, policy_bytes
 from iwm_power_manager.replay import demand
+from iwm_power_manager.replay.recorded import RecordedDrive
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.recorded import RecordedDrive
 from iwm_power_manager.tools import solve_policy
 from iwm_power_manager.vehicle import load_vehicle
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +10,11 @@ import pytest
 
 from bags_helpers import TWIST, ScriptedDrive, float64, topic, twist
 from iwm_power_manager.bags.writer import BagWriter
-from iwm_power_manager.errors import BagError
+from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.model.pedals import pedal_power_w
+from iwm_power_manager.replay.recorded import read_signal
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.mapping import load_mapping
-from iwm_power_manager.signals.recorded import read_signal
 from iwm_power_manager.vehicle import load_vehicle
 
 S = 1_000_000_000
@@ -85,13 +84,15 @@ def test_pedals_mean_what_the_vehicle_says(tmp_path: Path) -> None:
     expected = [pedal_power_w(a, b, 10.0, car) for a, b in ((0.0, 0.0), (0.25, 0.0), (0.5, 0.5), (0.75, 0.0))]
     assert drive.power_demand_w.tolist() == expected
     assert expected[2] < 0.0 < expected[3]
-    with pytest.raises(BagError, match="demand comes from pedals; name the vehicle"):
+    with pytest.raises(ConfigError, match="accelerator_pedal: is no power: name the vehicle"):
         read_signal(tmp_path / "bag", mapping)
 
 
-def test_a_bag_without_what_is_needed_says_what_it_holds(make_bag: Callable[..., Path]) -> None:
-    with pytest.raises(BagError, match=r"holds no topic that .*project.yaml maps to speed; it holds /a"):
-        read_signal(make_bag([("/a", 1, 1.0)]))
+def test_a_bag_without_what_is_needed_says_what_it_holds(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write(bag.add_topic(topic("/a")), 1, float64(1.0))
+    with pytest.raises(BagError, match=r"holds no topic that .*standard.yaml maps to speed; it holds /a"):
+        read_signal(tmp_path / "bag")
 
 
 def test_a_drive_of_this_project_reads_as_it_was_driven(tmp_path: Path) -> None:

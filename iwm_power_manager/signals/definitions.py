@@ -8,7 +8,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from iwm_power_manager.bags.metadata import Topic
 from iwm_power_manager.errors import BagError
 
 if TYPE_CHECKING:
@@ -32,36 +31,34 @@ def definition_of(msgtype: str) -> tuple[str, str]:
         The type is neither among Jazzy's own nor installed where AMENT_PREFIX_PATH or this Python can find it.
     """
     store = typestore()
-    _learn(msgtype)
+    _learn(store, msgtype)
     text, _ = store.generate_msgdef(msgtype, ros_version=2)
     return text, store.hash_rihs01(msgtype)
 
 
-def learn_definition(topic: Topic) -> None:
-    """Make a recorded topic's type known to `typestore`, from the definition that stands in the bag if need be.
+def learn(store: Typestore, msgtype: str, definition: str = "", topic: str = "") -> None:
+    """Make a type known to a store: from a definition, such as a bag carries, or from the installed `.msg` files.
 
     Raises
     ------
     BagError
-        The bag carries no definition that can be read, and none is installed.
+        The definition cannot be read, or none is given and none installed; names the topic, if one is given.
     """
-    store = typestore()
-    if topic.type in store.fielddefs:
+    if msgtype in store.fielddefs:
         return
-    if topic.definition:
-        from rosbags.typesys import TypesysError, get_types_from_msg
+    if not definition:
+        _learn(store, msgtype)
+        return
+    from rosbags.typesys import TypesysError, get_types_from_msg
 
-        try:
-            types = get_types_from_msg(topic.definition, topic.type)
-            store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
-            return
-        except TypesysError as error:
-            raise BagError(f"{topic.name}: the definition of {topic.type} cannot be read: {error}") from None
-    _learn(topic.type)
+    try:
+        types = get_types_from_msg(definition, msgtype)
+        store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
+    except TypesysError as error:
+        raise BagError(f"{topic}: the definition of {msgtype} cannot be read: {error}") from None
 
 
-def _learn(msgtype: str) -> None:
-    store = typestore()
+def _learn(store: Typestore, msgtype: str) -> None:
     if msgtype in store.fielddefs:
         return
     from rosbags.typesys import TypesysError, get_types_from_msg
@@ -76,7 +73,7 @@ def _learn(msgtype: str) -> None:
     for _, fields in types.values():
         for _, field in fields:
             for needed in _named_types(field):
-                _learn(needed)
+                _learn(store, needed)
     store.register(types)
 
 

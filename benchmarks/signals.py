@@ -1,0 +1,87 @@
+#!/usr/bin/env python3
+"""What it costs to turn the bytes of the four inputs into readings: the signals' readers beside rclpy's decoding.
+
+Both see the same bytes, turn about, in one process; the ratio is that of the fastest rounds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+
+from rclpy.serialization import deserialize_message, serialize_message
+
+from iwm_power_manager.ros import messages
+from iwm_power_manager.signals.contract import BATTERY_STATE, POWER_DEMAND, VEHICLE_SPEED, WHEEL_NAMES, WHEEL_STATES
+from iwm_power_manager.signals.mapping import load_mapping
+from iwm_power_manager.signals.readings import Assembly, topic_readers
+from iwm_power_manager.signals.types import types_of
+
+_TOPICS = (VEHICLE_SPEED, WHEEL_STATES, BATTERY_STATE, POWER_DEMAND)
+
+
+def inputs(count: int) -> list[dict[str, bytes]]:
+    """Bytes of one message of each topic, for each of `count` steps."""
+    made = []
+    for i in range(1, count + 1):
+        stamp_ns, wheels = i * 10_000_000, [0.1 * i + k for k in range(4)]
+        message = {
+            VEHICLE_SPEED: messages.vehicle_speed_message(stamp_ns, 0.03 * i),
+            WHEEL_STATES: messages.wheel_states_message(stamp_ns, WHEEL_NAMES, wheels, wheels),
+            BATTERY_STATE: messages.battery_state_message(stamp_ns, soc=0.5, voltage_v=200.0, discharge_current_a=3.0),
+            POWER_DEMAND: messages.number_message(5.0 * i),
+        }
+        made.append({topic: serialize_message(message[topic]) for topic in _TOPICS})
+    return made
+
+
+def contenders() -> dict[str, Callable[[dict[str, bytes]], object]]:
+    """Functions from the bytes of one step to its readings."""
+    mapping = load_mapping()
+    types = {source.topic: types_of(source.type) for sources in mapping.sources.values() for source in sources}
+    readers = topic_readers(mapping, types, Assembly(WHEEL_NAMES))
+    reads = {
+        VEHICLE_SPEED: messages.read_vehicle_speed,
+        WHEEL_STATES: messages.read_wheel_speeds,
+        BATTERY_STATE: messages.read_battery_state,
+        POWER_DEMAND: messages.read_number,
+    }
+    in_order = [(topic, readers[topic]) for topic in _TOPICS]
+    decoded = [(topic, messages.TOPIC_TYPES[topic], reads[topic]) for topic in _TOPICS]
+    return {
+        "signals": lambda step: [reader(step[topic], 0) for topic, reader in in_order],
+        "rclpy": lambda step: [read(deserialize_message(step[topic], kind)) for topic, kind, read in decoded],
+    }
+
+
+def fastest_us(names: list[str], rounds: int, steps: list[dict[str, bytes]]) -> dict[str, float]:
+    """Time for the inputs of one step, us, in the fastest round of each contender."""
+    ways = contenders()
+    best = dict.fromkeys(names, float("inf"))
+    for _ in range(rounds):
+        for name in names:
+            way = ways[name]
+            started = time.perf_counter()
+            for step in steps:
+                way(step)
+            best[name] = min(best[name], (time.perf_counter() - started) / len(steps) * 1e6)
+    return best
+
+
+def main() -> int:
+    """Print both times and their ratio."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--steps", type=int, default=2000)
+    options = parser.parse_args()
+    best = fastest_us(["signals", "rclpy"], options.rounds, inputs(options.steps))
+    for name, value in best.items():
+        print(f"{name:8} {value:6.2f} us for the four inputs of a step")
+    print(f"ratio rclpy / signals: {best['rclpy'] / best['signals']:.2f}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,360 @@
+"""Bytes of messages to readings, by a mapping: the same code for the live node and for bags.
+
+A topic has one reader, whatever signals it carries. What belongs together and comes apart (four wheels on four topics,
+two pedals, a battery in single numbers) is put together in an `Assembly`, which the readers of a mapping share. Values
+are converted here and judged in `control.inputs`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.model import pedals
+from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.signals.cdr import MessageReader, MessageWriter, UnreadableError, blank, field_kind
+from iwm_power_manager.signals.mapping import (
+    BATTERY,
+    DEMANDS,
+    JOINT_STATE,
+    PEDALS,
+    SIGNALS,
+    WHEELS,
+    SignalMapping,
+    Source,
+)
+from iwm_power_manager.signals.types import Types, types_of
+
+_NAN = math.nan
+#: Stamp of what cannot be read: older than anything.
+_NEVER_NS = -(1 << 62)
+#: A wheel of its own topic that has not come while another came so often is missing.
+_MISSED_SETS = 3
+_ARTICLES = {
+    "number": "a number",
+    "array": "an array",
+    "message": "a message",
+    "messages": "a list of messages",
+    "text": "a text",
+    "texts": "a list of texts",
+}
+
+
+class DemandReading(NamedTuple):
+    """What the driver wants, as power at the wheels, braking negative."""
+
+    stamp_ns: int
+    power_w: float
+
+
+class FrictionReading(NamedTuple):
+    """Peak friction coefficient of the road."""
+
+    stamp_ns: int
+    friction: float
+
+
+class MotionReading(NamedTuple):
+    """One of `mapping.MOTION`, in SI units: how the car turns, accelerates or is steered."""
+
+    stamp_ns: int
+    signal: str
+    value: float
+
+
+class NamedValues(NamedTuple):
+    """One of a JointState's fields of numbers, with the names."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+
+
+type Reading = SpeedReading | JointReading | BatteryReading | DemandReading | FrictionReading | MotionReading
+type _Bind = Callable[[int, tuple[Any, ...], tuple[str, ...]], tuple[Reading, ...]]
+
+
+class Assembly:
+    """What the readers of one mapping share.
+
+    Parameters
+    ----------
+    wheel_names : of the four wheels as the controller knows them
+    vehicle : the car, where a demand is no power or a wheel's speed is that of its rim; None where neither is so
+    speed_mps : speed of the car as it is believed at present; None: the last finite one that was read
+
+    Attributes
+    ----------
+    battery : last value of each of `mapping.BATTERY`, NaN before the first
+    """
+
+    def __init__(
+        self,
+        wheel_names: Sequence[str],
+        vehicle: VehicleParams | None = None,
+        speed_mps: Callable[[], float] | None = None,
+    ) -> None:
+        self.wheel_names = tuple(wheel_names)
+        self.vehicle = vehicle
+        self.battery = dict.fromkeys(BATTERY, _NAN)
+        self.speed_read_mps = 0.0
+        self._speed_mps = speed_mps or (lambda: self.speed_read_mps)
+        self._pedals = dict.fromkeys(PEDALS, 0.0)
+        self._wheels = [_NAN] * WHEELS
+        self._came = [0] * WHEELS
+
+    def demand_w(self, signal: str, value: float) -> float:
+        """A demand in its own unit as power at the present speed, W."""
+        if signal == "power_demand":
+            return value
+        vehicle, speed = self.vehicle, max(self._speed_mps(), 0.0)
+        assert vehicle is not None  # checked when the readers were made
+        if signal == "force_demand":
+            return pedals.force_power_w(value, speed, vehicle)
+        if signal == "torque_demand":
+            return pedals.torque_power_w(value, speed, vehicle)
+        if signal == "acceleration_demand":
+            return pedals.acceleration_power_w(value, speed, vehicle)
+        # A pedal that says nothing is not pressed less far than it goes; NaN stays NaN and is refused.
+        self._pedals[signal] = value if math.isnan(value) else min(max(value, 0.0), 1.0)
+        accelerator, brake = self._pedals.values()
+        if brake > 0.0:  # a brake demand gets through whatever the accelerator says
+            return float(pedals.pedal_power_w(0.0, brake, speed, vehicle))
+        return _NAN if math.isnan(brake) else float(pedals.pedal_power_w(accelerator, brake, speed, vehicle))
+
+    def wheel(self, wheel: int, time_ns: int, speed_radps: float) -> tuple[Reading, ...]:
+        """One wheel's speed; a reading once all four have come, or one of them has stayed away for long."""
+        self._wheels[wheel] = speed_radps
+        self._came[wheel] += 1
+        if 0 in self._came and self._came[wheel] < _MISSED_SETS:
+            return ()
+        speeds = tuple(speed if came else _NAN for speed, came in zip(self._wheels, self._came, strict=True))
+        self._came = [0] * WHEELS
+        return (JointReading(time_ns, self.wheel_names, speeds),)
+
+
+class TopicReader:
+    """Bytes of one topic's messages to readings.
+
+    Attributes
+    ----------
+    signals : that the topic carries
+    sources : of these
+    stamped : readings have the time of the message's header, else that given by the caller
+    unreadable : readings that stand for a message that cannot be read, for the checks to refuse and count
+    """
+
+    def __init__(
+        self, signals: Sequence[str], sources: Sequence[Source], reader: MessageReader[tuple[Reading, ...]]
+    ) -> None:
+        self.signals = tuple(signals)
+        self.sources = tuple(sources)
+        self.stamped = reader.stamped
+        self.unreadable = tuple(reading for signal in dict.fromkeys(signals) if (reading := _unreadable(signal)))
+        self.read = reader
+
+    def __call__(self, data: bytes, time_ns: int) -> tuple[Reading, ...]:
+        """Readings of a message; `unreadable` if it is none of its type."""
+        try:
+            return self.read(data, time_ns)
+        except UnreadableError:
+            return self.unreadable
+
+
+def topic_readers(
+    mapping: SignalMapping, types: Mapping[str, Types], assembly: Assembly, signals: Iterable[str] = ()
+) -> dict[str, TopicReader]:
+    """A reader for each topic that carries a mapped signal.
+
+    Parameters
+    ----------
+    mapping : topics, fields and units
+    types : by topic as the mapping names it; a topic that is not here is left out
+    assembly : shared by the readers
+    signals : those that are wanted; () for all
+
+    Raises
+    ------
+    ConfigError
+        A field does not exist in the type of its topic, or is no number; names the key.
+    """
+    by_topic: dict[str, list[tuple[str, int, Source]]] = defaultdict(list)
+    for signal in sorted(mapping.sources, key=SIGNALS.index):  # the speed before what is judged or converted by it
+        sources = mapping.sources[signal]
+        for wheel, source in enumerate(sources):
+            if source.topic in types and (not signals or signal in signals):
+                by_topic[source.topic].append((signal, wheel if len(sources) > 1 else -1, source))
+    return {topic: _topic_reader(mapping.path, types[topic], found, assembly) for topic, found in by_topic.items()}
+
+
+def _topic_reader(file: Path, types: Types, found: list[tuple[str, int, Source]], assembly: Assembly) -> TopicReader:
+    fields: dict[str, int] = {}
+    names = ""
+    stamped = True
+    binds: list[_Bind] = []
+    for signal, wheel, source in found:
+        _check_source(file, types, source, all_wheels=signal == "wheel_speed" and wheel < 0)
+        _check_vehicle(file, signal, source, assembly.vehicle)
+        place = fields.setdefault(source.field, len(fields))
+        names = names or (_names_path(source.field) if source.names else "")
+        stamped = stamped and source.stamp == "header"
+        if signal not in BATTERY:
+            binds.append(_bind(signal, wheel, source, place, assembly))
+    battery = {signal: (fields[source.field], _scale(source)) for signal, _, source in found if signal in BATTERY}
+    if battery:
+        binds.append(_bind_battery(battery, assembly))
+    reader = MessageReader(types, list(fields), _together(binds), names, stamped=stamped)
+    return TopicReader([signal for signal, _, _ in found], [source for _, _, source in found], reader)
+
+
+def _together(binds: list[_Bind]) -> _Bind:
+    if len(binds) == 1:
+        return binds[0]
+
+    def all_of_them(time_ns: int, values: tuple[Any, ...], names: tuple[str, ...]) -> tuple[Reading, ...]:
+        return tuple([reading for bind in binds for reading in bind(time_ns, values, names)])
+
+    return all_of_them
+
+
+def _names_path(field: str) -> str:
+    return ".".join([*field.split(".")[:-1], "name"])
+
+
+def _check_source(file: Path, types: Types, source: Source, *, all_wheels: bool) -> None:
+    msgtype = types.name
+    if source.type and source.type != msgtype:
+        raise ConfigError(file, f"{source.key}.type", f"{source.topic} carries {msgtype}, not {source.type}")
+    kind = field_kind(types, source.field)
+    wanted = "array" if all_wheels else "number"
+    if kind != wanted:
+        problem = f"{source.field} is {_ARTICLES[kind]}" if kind else f"{msgtype} has no field {source.field}"
+        raise ConfigError(file, f"{source.key}.field", problem, f"a field of {msgtype} that is {_ARTICLES[wanted]}")
+    if source.names and field_kind(types, _names_path(source.field)) != "texts":
+        raise ConfigError(file, f"{source.key}.names", f"{msgtype} has no field `name` beside {source.field}")
+
+
+def _check_vehicle(file: Path, signal: str, source: Source, vehicle: VehicleParams | None) -> None:
+    if vehicle is None and source.unit.rolling:
+        raise ConfigError(file, f"{source.key}.unit", "the speed of a rim needs the wheel's radius; name the vehicle")
+    if vehicle is None and signal in (*PEDALS, *DEMANDS[1:]):
+        raise ConfigError(file, source.key, "is no power: name the vehicle that says what it means")
+
+
+def _scale(source: Source, radius_m: float = 1.0) -> Callable[[float], float] | None:
+    """From a message's number to SI units; None if they are the same."""
+    over = 1.0 / radius_m if source.unit.rolling else 1.0
+    factor = source.factor * source.unit.factor * over
+    offset = (source.offset * source.unit.factor + source.unit.offset) * over
+    if offset:
+        return lambda value: factor * value + offset
+    return None if factor == 1.0 else lambda value: factor * value
+
+
+def _bind(signal: str, wheel: int, source: Source, place: int, assembly: Assembly) -> _Bind:
+    """Function from a message's wanted values to the readings they give."""
+    scale = _scale(source, assembly.vehicle.front.wheel.radius_m if assembly.vehicle else 1.0)
+    if signal == "speed":
+        return _bind_speed(place, scale, assembly)
+    if signal == "wheel_speed" and wheel < 0:
+        return _bind_wheels(source, place, scale, assembly)
+    if signal == "power_demand" and scale is None:
+        return lambda time_ns, values, _: (DemandReading(time_ns, values[place]),)
+    scaled = scale or (lambda value: value)
+    if signal == "wheel_speed":
+        return lambda time_ns, values, _: assembly.wheel(wheel, time_ns, scaled(values[place]))
+    if signal in DEMANDS or signal in PEDALS:
+        return lambda time_ns, values, _: (DemandReading(time_ns, assembly.demand_w(signal, scaled(values[place]))),)
+    if signal == "friction":
+        return lambda time_ns, values, _: (FrictionReading(time_ns, scaled(values[place])),)
+    return lambda time_ns, values, _: (MotionReading(time_ns, signal, scaled(values[place])),)
+
+
+def _bind_speed(place: int, scale: Callable[[float], float] | None, assembly: Assembly) -> _Bind:
+    def speed(time_ns: int, values: tuple[Any, ...], _: tuple[str, ...]) -> tuple[Reading, ...]:
+        value = values[place] if scale is None else scale(values[place])
+        if value == value:  # NaN is not
+            assembly.speed_read_mps = value
+        return (SpeedReading(time_ns, value),)
+
+    return speed
+
+
+def _bind_wheels(source: Source, place: int, scale: Callable[[float], float] | None, assembly: Assembly) -> _Bind:
+    """Four wheels in one message: by name, under the controller's names, or as an array in the right order."""
+    ours = dict(zip(source.names, assembly.wheel_names, strict=True)) if source.names else {}
+    signs = dict(zip(source.names or assembly.wheel_names, source.signs, strict=True)) if source.signs else {}
+    seen: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
+    turned: tuple[float, ...] = ()
+
+    def wheels(time_ns: int, values: tuple[Any, ...], names: tuple[str, ...]) -> tuple[Reading, ...]:
+        nonlocal seen, known, turned
+        speeds = values[place]
+        if not ours:
+            names = assembly.wheel_names
+        if names is not seen:  # the reader gives the same object for the same names
+            seen, known = names, tuple(ours.get(name, name) for name in names) if ours else names
+            turned = tuple(signs.get(name, 1.0) for name in names) if signs else ()
+        if scale is not None:
+            speeds = tuple(map(scale, speeds))
+        if turned and len(turned) == len(speeds):
+            speeds = tuple(sign * speed for sign, speed in zip(turned, speeds, strict=True))
+        return (JointReading(time_ns, known, speeds),)
+
+    return wheels
+
+
+def _bind_battery(places: Mapping[str, tuple[int, Callable[[float], float] | None]], assembly: Assembly) -> _Bind:
+    held = assembly.battery
+    items = tuple((signal, place, scale) for signal, (place, scale) in places.items())
+    charge = "soc" in places
+
+    def battery(time_ns: int, values: tuple[Any, ...], _: tuple[str, ...]) -> tuple[Reading, ...]:
+        for signal, place, scale in items:
+            held[signal] = values[place] if scale is None else scale(values[place])
+        return (BatteryReading(time_ns, *held.values()),) if charge else ()
+
+    return battery
+
+
+def _unreadable(signal: str) -> Reading | None:
+    if signal == "speed":
+        return SpeedReading(_NEVER_NS, _NAN)
+    if signal == "wheel_speed":
+        return JointReading(_NEVER_NS, (), ())
+    if signal == "soc":
+        return BatteryReading(_NEVER_NS, _NAN, _NAN, _NAN, _NAN)
+    if signal in DEMANDS or signal in PEDALS:
+        return DemandReading(_NEVER_NS, _NAN)
+    return FrictionReading(_NEVER_NS, _NAN) if signal == "friction" else None
+
+
+def joint_state_reader(field: str) -> MessageReader[NamedValues]:
+    """Reader of one of a JointState's fields with its names, as the project's own commands and reports carry them.
+
+    It raises `UnreadableError` for damaged bytes and for as many names as there are not values.
+    """
+
+    def named(stamp_ns: int, values: tuple[Any, ...], names: tuple[str, ...]) -> NamedValues:
+        if len(names) != len(values[0]):
+            raise UnreadableError(f"{len(names)} names and {len(values[0])} values")
+        return NamedValues(stamp_ns, names, values[0])
+
+    return MessageReader(types_of(JOINT_STATE), [field], named, "name")
+
+
+def joint_state_writer(names: Sequence[str], field: str) -> MessageWriter:
+    """Writer of JointStates that have the same names and fill the same field."""
+    import numpy as np
+
+    types = types_of(JOINT_STATE)
+    message = blank(types)
+    message.name = list(names)
+    setattr(message, field, np.zeros(len(names)))
+    return MessageWriter(types, bytes(types.store.serialize_cdr(message, JOINT_STATE)), field)
