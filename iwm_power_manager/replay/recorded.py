@@ -22,7 +22,7 @@ from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.signals.mapping import DEMANDS, PEDALS, SignalMapping, load_mapping, topic_named
 from iwm_power_manager.signals.readings import Assembly, DemandReading, Reading, TopicReader, topic_readers
-from iwm_power_manager.signals.types import MSG, Types, types_of
+from iwm_power_manager.signals.types import Types, types_of
 
 FloatArray = NDArray[np.float64]
 
@@ -131,7 +131,7 @@ class SignalStream:
 def _types(topic: Topic) -> Types:
     """The types of a recorded topic by the definition in its bag."""
     try:
-        return types_of(topic.type, MSG if topic.definition else "", topic.definition)
+        return types_of(topic.type, topic.encoding, topic.definition)
     except BagError as error:
         raise BagError(f"{topic.name}: {error}") from None
 
