@@ -152,7 +152,7 @@ class InputMonitor:
         self.forget()
 
     def forget(self) -> None:
-        """Start again without history, as at activation or after the clock jumped back; counters stay."""
+        """Start again without history, as at activation; counters stay."""
         self.speed_mps = 0.0
         self.wheel_speed_radps: Wheels = (0.0, 0.0, 0.0, 0.0)
         self.demand_w = 0.0
@@ -162,6 +162,10 @@ class InputMonitor:
         self.friction = math.nan
         self.verdicts = (WheelVerdict.GOOD,) * 4
         self._wheel_memory = NEW_WHEELS
+        self.forget_times()
+
+    def forget_times(self) -> None:
+        """Keep the values, but not how old they are: after the clock was set back. All inputs count as missing."""
         self._wheels_ns: int | None = None
         for tally in self.tallies.values():
             tally.accepted_ns = None
@@ -177,9 +181,9 @@ class InputMonitor:
         )
 
     @property
-    def complete(self) -> bool:
-        """Every input the law needs has been accepted once."""
-        return math.inf not in self.ages_s(0)
+    def driven(self) -> bool:
+        """A speed and a demand have been accepted: the least a step needs beside wheel speeds."""
+        return self.tallies[SPEED].accepted_ns is not None and self.tallies[DEMAND].accepted_ns is not None
 
     def take_speed(self, reading: SpeedReading, now_ns: int) -> bool:
         """Judge `vehicle_speed`; True if it was accepted."""

@@ -53,11 +53,16 @@ class Setting(NamedTuple):
         """Meaning and unit."""
         return f"{self.meaning}, {self.unit}" if self.unit else self.meaning
 
+    @property
+    def is_flag(self) -> bool:
+        """It is true or false."""
+        return not self.choices and math.isinf(self.low) and math.isinf(self.high)
+
     def allowed(self) -> str:
-        """What a value may be, for messages and documentation; "" where its type says all."""
+        """What a value may be, for messages and documentation."""
         if self.choices:
             return " | ".join(self.choices)
-        return "" if math.isinf(self.low) and math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
+        return "true | false" if self.is_flag else f"{self.low:g} to {self.high:g}"
 
 
 class Settings(NamedTuple):
@@ -141,9 +146,11 @@ def problem_with(setting: Setting, value: Any) -> str:
     """What is wrong with a value as people give it (a choice by its name); "" if nothing is."""
     if setting.choices:
         wrong = value not in setting.choices
+    elif setting.is_flag:
+        wrong = not isinstance(value, bool)
     else:
         # Written so that NaN is refused.
-        wrong = not isinstance(value, bool | str) and not setting.low <= value <= setting.high
+        wrong = isinstance(value, bool | str) or not setting.low <= value <= setting.high
     return f"{value!r} is not allowed; allowed: {setting.allowed()}" if wrong else ""
 
 
@@ -171,22 +178,18 @@ def parse(source: str, name: str, text: str) -> Any:
     """
     if name not in TABLE:
         raise ConfigError(source, name, "is no setting of the law", ", ".join(TABLE))
-    setting, default = TABLE[name], getattr(DEFAULTS, name)
+    setting = TABLE[name]
     value: Any = text
-    if setting.choices:
-        problem = problem_with(setting, text)
-    elif isinstance(default, bool):
-        problem = "" if text in ("true", "false") else f"{text!r} is neither true nor false"
-        value = text == "true"
-    else:
+    if setting.is_flag:
+        value = {"true": True, "false": False}.get(text, text)
+    elif not setting.choices:
         try:
             value = float(text)
         except ValueError:
-            value = math.nan
-        problem = problem_with(setting, value)
-    if problem:
-        raise ConfigError(source, name, f"{text!r} is not allowed", setting.allowed() or "true | false")
-    return setting.choices[value] if setting.choices else value
+            value = text
+    if problem_with(setting, value):
+        raise ConfigError(source, name, f"{text!r} is not allowed", setting.allowed())
+    return setting.choices[text] if setting.choices else value
 
 
 def check_together(values: Mapping[str, Any]) -> str:

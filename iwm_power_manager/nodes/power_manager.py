@@ -27,10 +27,12 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
-from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
+from iwm_power_manager.control.controller import Controller, ControllerLimits
+from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS
 from iwm_power_manager.control.monitor import BatteryReading, InputMonitor, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.control.stepping import Lockstep, RealTime, Taken
+from iwm_power_manager.control.thresholds import input_limits, supervision_limits
 from iwm_power_manager.errors import BagError, ConfigError, IwmError
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.demand_log import DemandLog
@@ -86,8 +88,9 @@ class PowerManager(LifecycleNode):
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         self._lockstep: bool = self._values["lockstep"]
-        self._queue = LockstepQueue()
         self._controller: Controller | None = None
+        self._stepper: Lockstep | RealTime | None = None
+        self._restarts = 0
         self._policies: Policies | None = None
         self._demand_log: DemandLog | None = None
         self._intake = Intake(self)
@@ -98,7 +101,6 @@ class PowerManager(LifecycleNode):
         self._fault = ""
         self._wheel_names: tuple[str, ...] = tuple(self._values["wheel_names"])
         self._period_s = 1.0 / self._values["rate_hz"]
-        self._last_step_ns: int | None = None
         self._last_step_steady_s = 0.0
         self._answer: dict[str, JointState] | None = None
         self._readers: dict[str, TopicReader] = {}
@@ -138,7 +140,8 @@ class PowerManager(LifecycleNode):
         """Start commanding, from the law's initial state."""
         self._fault = ""
         self._intake.drop_all()
-        self._queue.clear()
+        if isinstance(self._stepper, Lockstep):
+            self._stepper.queue.clear()
         self._start_over()
         result = super().on_activate(state)
         self._active = True
@@ -211,10 +214,11 @@ class PowerManager(LifecycleNode):
         )
         if policies.fallback_reason:
             self.get_logger().warning(f"runs equal split instead of {values['strategy']}: {policies.fallback_reason}")
+        thresholds = config.thresholds_of(values)
         limits = ControllerLimits(
-            config.input_limits(values, vehicle.params.front.wheel.radius_m),
+            input_limits(thresholds, vehicle.params.front.wheel.radius_m, by_clock=not self._lockstep),
             None if self._lockstep else config.age_limits_s(values),
-            config.supervision_limits(values),
+            supervision_limits(thresholds),
         )
         self._wheel_names = tuple(values["wheel_names"])
         self._period_s = 1.0 / values["rate_hz"]
@@ -225,6 +229,11 @@ class PowerManager(LifecycleNode):
             config.law_settings(values, policies.strategy),
             policies.table(values["friction"]),
             values["friction"],
+        )
+        self._stepper = (
+            Lockstep(self._controller, self._period_s)
+            if self._lockstep
+            else RealTime(self._controller, self._period_s, thresholds)
         )
         self._policies = policies
         self._readers = self._make_readers(vehicle)
@@ -301,6 +310,7 @@ class PowerManager(LifecycleNode):
         self._readers = {}
         self._demand_reader = None
         self._controller = None
+        self._stepper = None
         self._policies = None
         if self._demand_log:
             self._demand_log.close()
@@ -322,11 +332,16 @@ class PowerManager(LifecycleNode):
             self.get_logger().error(problem)
 
     def _start_over(self) -> None:
-        assert self._controller is not None
-        self._controller.reset()
+        assert self._stepper is not None
+        self._stepper.start_over()
+        self._began_anew()
+
+    def _began_anew(self) -> None:
+        """A run begins: what was before it does not go on."""
+        assert self._stepper is not None
+        self._restarts = self._stepper.restarts
         if self._demand_log:
             self._demand_log.pause()
-        self._last_step_ns = None
         self._answer = None
 
     # Inputs
@@ -357,27 +372,30 @@ class PowerManager(LifecycleNode):
     def _on_demand(self, data: bytes, info: dict[str, Any]) -> None:
         """Lock-step: the demand closes a set."""
         if self._active and self._demand_reader is not None:
+            assert isinstance(self._stepper, Lockstep)
             sent_ns = info["source_timestamp"]
             for reading in self._demand_reader(data, sent_ns):
                 if isinstance(reading, DemandReading):
-                    self._queue.push_demand(sent_ns, reading.power_w)
+                    self._stepper.queue.push_demand(sent_ns, reading.power_w)
             # Topics are not ordered among each other: what was sent before may still be a moment away.
             for _ in range(_SET_PATIENCE):
                 self._collect_sets()
-                if not self._queue.waiting:
+                if self._stepper is None or not self._stepper.queue.waiting:
                     break
                 time.sleep(_SET_POLL_S)
 
     def _collect_sets(self) -> None:
-        assert self._controller is not None
+        if not isinstance(self._stepper, Lockstep):
+            return
+        monitor, queues = self._stepper.controller.monitor, self._stepper.queue
         for topic, reader in self._readers.items():
             for data, info in self._intake.take(topic):
                 for reading in reader(data, info["source_timestamp"]):
                     queue = _QUEUES.get(type(reading))
                     if queue is not None:
-                        self._queue.push(queue, reading.stamp_ns, info["source_timestamp"], reading)
+                        queues.push(queue, reading.stamp_ns, info["source_timestamp"], reading)
                     else:
-                        self._judge(self._controller.monitor, reading, self._now_ns())
+                        self._judge(monitor, reading, self._now_ns())
         self._step_complete_sets()
 
     # Steps
@@ -405,49 +423,40 @@ class PowerManager(LifecycleNode):
         return True
 
     def _on_step_timer(self) -> None:
-        assert self._controller is not None
+        assert isinstance(self._stepper, RealTime)
+        self._stepper.begin(None if self.get_clock().ros_time_is_active else time.monotonic())
         self._take_inputs()
-        now_ns = self._now_ns()
-        since_s = None if self._last_step_ns is None else (now_ns - self._last_step_ns) / _NS_PER_S
-        if since_s is not None and since_s <= 0.0:
-            # The clock jumped back: the stamps and ages of before mean nothing now.
-            self._controller.monitor.forget()
-            since_s = None
-        dt_s = self._period_s if since_s is None else min(max(since_s, 0.2 * self._period_s), 3.0 * self._period_s)
-        self._take_step(now_ns, dt_s, since_s)
+        started_s = time.perf_counter()
+        self._take(self._stepper.step(self._now_ns()), started_s)
         if self._report_due:
             # Right after a step there is the most time until the next.
             self._publish_report()
 
     def _step_complete_sets(self) -> None:
-        if not self._active or self._controller is None:
+        if not self._active or not isinstance(self._stepper, Lockstep):
             return
-        while (inputs := self._queue.pop()) is not None:
-            if inputs.demand is None:
-                if self._answer is not None:
-                    self._publish(self._answer)
-                continue
-            if self._last_step_ns is not None and inputs.stamp_ns < self._last_step_ns:
-                self._start_over()
-            since_s = None if self._last_step_ns is None else (inputs.stamp_ns - self._last_step_ns) / _NS_PER_S
-            monitor = self._controller.monitor
-            monitor.take_speed(inputs.speed, inputs.stamp_ns)
-            monitor.take_wheels(inputs.wheels, inputs.stamp_ns)
-            monitor.take_battery(inputs.battery, inputs.stamp_ns)
-            monitor.take_demand(inputs.demand, 0.0, inputs.stamp_ns)
-            self._take_step(inputs.stamp_ns, self._period_s if since_s is None else since_s, since_s)
-
-    def _take_step(self, stamp_ns: int, dt_s: float, since_s: float | None) -> None:
-        assert self._controller is not None
         started_s = time.perf_counter()
-        self._last_step_ns = stamp_ns
+        for taken in self._stepper.steps():
+            self._take(taken, started_s)
+            started_s = time.perf_counter()
+            if not self._active:
+                break
+
+    def _take(self, taken: Taken, started_s: float) -> None:
+        """Send what came of a step."""
+        assert self._stepper is not None
         self._last_step_steady_s = time.monotonic()
-        try:
-            command, numbers = self._controller.step(stamp_ns, dt_s, since_s)
-        except ControlFaultError as error:
-            self.fail(str(error))
+        if taken.fault:
+            self.fail(taken.fault)
             return
-        names = self._wheel_names
+        if self._stepper.restarts != self._restarts:
+            self._began_anew()
+        if taken.step is None:
+            if self._answer is not None:
+                self._publish(self._answer)
+            return
+        command, numbers = taken.step
+        stamp_ns, names = taken.stamp_ns, self._wheel_names
         self._answer = {
             messages.WHEEL_TORQUE_COMMAND: messages.torque_command_message(stamp_ns, names, command.motor_torque_nm),
             messages.FRICTION_BRAKE_COMMAND: messages.torque_command_message(
@@ -455,10 +464,12 @@ class PowerManager(LifecycleNode):
             ),
             messages.POWER_MANAGER_STATE: messages.named_numbers_message(stamp_ns, SIGNAL_NAMES, numbers),
         }
+        if isinstance(self._stepper, RealTime) and not self._stepper.may_send(time.monotonic()):
+            return
         self._publish(self._answer)
         if self._demand_log:
-            self._demand_log.note(stamp_ns, numbers)
-        self._report.note_step(command, since_s, time.perf_counter() - started_s)
+            self._demand_log.note(taken.stamp_ns, numbers)
+        self._report.note_step(command, taken.since_s, time.perf_counter() - started_s)
 
     def _publish(self, answer: Mapping[str, JointState]) -> None:
         for topic, message in answer.items():
@@ -528,7 +539,7 @@ class PowerManager(LifecycleNode):
                 self._fault = "the clock stands still"
                 self._start_over()
                 self._command_zero()
-            elif self._fault and self._last_step_ns is not None:
+            elif self._fault and self._stepper is not None and self._stepper.last_ns is not None:
                 self._fault = ""
         shown = controller and (controller.supervision.mode, controller.supervision.stale, controller.wheels_lost)
         gate = controller and controller.command and controller.command.gate

@@ -5,32 +5,30 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from iwm_power_manager.control import settings
-from iwm_power_manager.control.inputs import StampLimits, ValueLimits, WheelLimits
-from iwm_power_manager.control.monitor import InputLimits
+from iwm_power_manager.control import settings, thresholds
 from iwm_power_manager.control.settings import Change
-from iwm_power_manager.control.supervision import SupervisionLimits
 from iwm_power_manager.ros import messages
 from iwm_power_manager.ros.parameters import Spec, yaml_text
 from iwm_power_manager.signals.mapping import DEFAULT_MAPPING
 
-_INF = float("inf")
 
-
-def _law_specs() -> list[Spec]:
-    """A parameter for each setting of the control law."""
-    return [
-        Spec(
-            name,
-            settings.shown(name, getattr(settings.DEFAULTS, name)),
-            f"Control law: {known.described()}.",
-            known.low,
-            known.high,
-            choices=tuple(known.choices),
-            change=known.change,
+def _specs(table: Mapping[str, settings.Setting], defaults: Mapping[str, Any], about: str = "") -> list[Spec]:
+    """A parameter for each row of one of the law's tables."""
+    specs = []
+    for name, known in table.items():
+        sentence = about + known.described()
+        specs.append(
+            Spec(
+                name,
+                next((text for text, code in known.choices.items() if code == defaults[name]), defaults[name]),
+                f"{sentence[0].upper()}{sentence[1:]}.",
+                known.low,
+                known.high,
+                choices=tuple(known.choices),
+                change=known.change,
+            )
         )
-        for name, known in settings.TABLE.items()
-    ]
+    return specs
 
 
 SPECS = (
@@ -75,7 +73,7 @@ SPECS = (
         "Names of the wheels in JointState messages, in the order front left, front right, rear left, rear right.",
         length=4,
     ),
-    *_law_specs(),
+    *_specs(settings.TABLE, settings.DEFAULTS._asdict(), "Control law: "),
     Spec("friction", 0.9, "Peak friction coefficient the strategy assumes.", 0.05, 1.5, change=Change.ALWAYS),
     Spec(
         "friction_source",
@@ -90,47 +88,7 @@ SPECS = (
     Spec("input_period_s.wheel_states", 0.01, "Period of wheel_states, s.", 0.0005, 10.0),
     Spec("input_period_s.power_demand", 0.01, "Period of power_demand, s.", 0.0005, 10.0),
     Spec("input_period_s.battery_state", 0.1, "Period of battery_state, s.", 0.0005, 10.0),
-    Spec("stamp_oldest_s", 0.1, "A message stamped longer ago than this is dropped, s.", 0.001, 60.0),
-    Spec("stamp_future_s", 0.02, "A message stamped further ahead than this is dropped, s.", 0.0, 60.0),
-    Spec("speed_max_mps", 60.0, "Largest believed vehicle speed, m/s.", 1.0, 150.0),
-    Spec("speed_rate_mps2", 25.0, "Largest believed change of vehicle speed, m/s2.", 1.0, 1000.0),
-    Spec("wheel_speed_max_radps", 300.0, "Largest believed wheel speed, rad/s.", 1.0, 2000.0),
-    Spec("wheel_rate_radps2", 2000.0, "Largest believed change of a wheel speed, rad/s2.", 1.0, 1e5),
-    Spec(
-        "wheel_stuck_s",
-        1.0,
-        "A wheel speed that stays the same for longer while the car and the axle's other wheel change is stuck, s.",
-        0.05,
-        60.0,
-    ),
-    Spec(
-        "wheel_stray_s",
-        1.0,
-        "A wheel speed far from both the axle's other wheel and the car for longer is lost, s.",
-        0.05,
-        60.0,
-    ),
-    Spec("wheel_stray_radps", 20.0, "How far is far, rad/s.", 1.0, 500.0),
-    Spec("wheel_distrust_s", 0.5, "A lost wheel has to be good for this long before it is used again, s.", 0.0, 60.0),
-    Spec("demand_max_w", 150e3, "Largest believed driving demand, W.", 100.0, 5e6),
-    Spec("demand_min_w", -600e3, "Largest believed braking demand, W, negative.", -2e7, -100.0),
-    Spec(
-        "demand_rise_wps",
-        5e6,
-        "Largest believed rise of the demand, W/s; braking may come as fast as it likes.",
-        1e3,
-        1e9,
-    ),
-    Spec("fade_s", 0.3, "An input is missing: motor torque fades to zero in this time, s.", 0.01, 10.0),
-    Spec(
-        "brake_release_s",
-        2.0,
-        "power_demand is missing while braking: the braking force is released in this time, s.",
-        0.01,
-        30.0,
-    ),
-    Spec("recover_s", 0.5, "Inputs have to be good for this long before torque comes back, s.", 0.0, 60.0),
-    Spec("resume_s", 0.5, "Torque comes back from zero to full in this time, s.", 0.01, 60.0),
+    *_specs(thresholds.TABLE, thresholds.Thresholds()._asdict()),
     Spec(
         "clock_stopped_s",
         0.5,
@@ -235,37 +193,9 @@ def age_limits_s(values: Mapping[str, Any]) -> tuple[float, float, float, float]
     )
 
 
-def supervision_limits(values: Mapping[str, Any]) -> SupervisionLimits:
-    """Times of the degraded state."""
-    return SupervisionLimits(values["fade_s"], values["brake_release_s"], values["recover_s"], values["resume_s"])
-
-
-def input_limits(values: Mapping[str, Any], radius_m: float) -> InputLimits:
-    """What inputs are judged by."""
-    wheel_rate = values["wheel_rate_radps2"]
-    speed_rate = values["speed_rate_mps2"]
-    return InputLimits(
-        stamp=None if values["lockstep"] else StampLimits(values["stamp_oldest_s"], values["stamp_future_s"]),
-        demand_delay_s=_INF if values["lockstep"] else values["stamp_oldest_s"],
-        speed=ValueLimits(-1.0, values["speed_max_mps"], speed_rate, speed_rate, 0.6),
-        demand=ValueLimits(values["demand_min_w"], values["demand_max_w"], values["demand_rise_wps"], _INF, 5e3),
-        soc=ValueLimits(0.0, 1.0, 0.01, 0.01, 0.02),
-        temperature=ValueLimits(-60.0, 150.0, 2.0, 2.0, 3.0),
-        friction=ValueLimits(0.05, 1.5, _INF, _INF, 0.0),
-        wheels=WheelLimits(
-            value=ValueLimits(
-                -values["wheel_speed_max_radps"], values["wheel_speed_max_radps"], wheel_rate, wheel_rate, 3.0
-            ),
-            opposite_radps=3.0,
-            moving_mps=1.0,
-            stuck_s=values["wheel_stuck_s"],
-            stuck_change_radps=1.0,
-            stray_s=values["wheel_stray_s"],
-            stray_radps=values["wheel_stray_radps"],
-            distrust_s=values["wheel_distrust_s"],
-        ),
-        radius_m=radius_m,
-    )
+def thresholds_of(values: Mapping[str, Any]) -> thresholds.Thresholds:
+    """What inputs are believed, and how the degraded state goes."""
+    return thresholds.Thresholds(**{name: values[name] for name in thresholds.TABLE})
 
 
 def parameter_file() -> str:

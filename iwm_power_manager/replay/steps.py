@@ -8,9 +8,8 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from iwm_power_manager.control import law, lockstep
-from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
+from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.guard import violated_bound
-from iwm_power_manager.control.inputs import ValueLimits, WheelLimits
 from iwm_power_manager.control.monitor import (
     BATTERY,
     DEMAND,
@@ -18,21 +17,17 @@ from iwm_power_manager.control.monitor import (
     SPEED,
     WHEELS,
     BatteryReading,
-    InputLimits,
     JointReading,
     SpeedReading,
 )
 from iwm_power_manager.control.record import SIGNAL_NAMES, from_numbers
-from iwm_power_manager.control.supervision import SupervisionLimits
+from iwm_power_manager.control.stepping import AsRecorded, Lockstep, Taken
+from iwm_power_manager.control.thresholds import RECORDED, input_limits, supervision_limits
 from iwm_power_manager.control.types import Command, ControllerState, initial_state
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import Recorded
 from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.signals.readings import DemandReading, FrictionReading, NamedValues
-
-_NS_PER_S = 1_000_000_000
-_NAN = float("nan")
-_INF = float("inf")
 
 #: What each kind of reading is to the controller.
 _TOPICS = {
@@ -46,29 +41,6 @@ _TOPICS = {
 _PAUSE_S = 1.0
 #: Values from the start of a bag that show whether its messages come in sets of one stamp.
 _PROBE_VALUES = 400
-
-#: What recorded inputs are judged by: finite, and physically possible. Stamps are not judged: there is no clock here.
-INPUT_LIMITS = InputLimits(
-    stamp=None,
-    demand_delay_s=_INF,
-    speed=ValueLimits(-1.0, 150.0, 100.0, 100.0, 1.0),
-    demand=ValueLimits(-2e7, 5e6, _INF, _INF, 0.0),
-    soc=ValueLimits(0.0, 1.0, _INF, _INF, 0.0),
-    temperature=ValueLimits(-60.0, 150.0, _INF, _INF, 0.0),
-    friction=ValueLimits(0.05, 1.5, _INF, _INF, 0.0),
-    wheels=WheelLimits(
-        value=ValueLimits(-2000.0, 2000.0, 1e4, 1e4, 3.0),
-        opposite_radps=3.0,
-        moving_mps=1.0,
-        stuck_s=_INF,
-        stuck_change_radps=1.0,
-        stray_s=_INF,
-        stray_radps=500.0,
-        distrust_s=0.5,
-    ),
-    radius_m=_NAN,
-)
-
 
 class ReplayedStep(NamedTuple):
     """One step of the law.
@@ -162,23 +134,26 @@ class ReconstructedSteps:
     Attributes
     ----------
     in_sets : the inputs come in sets of one stamp
-    restarts : pauses in the recording after which the law started anew
     faults : steps whose command no motor may be given
     """
 
     def __init__(self, plan: Plan, probe: Iterable[Recorded]) -> None:
-        self.restarts = 0
         self.faults: Counter[str] = Counter()
         self._plan = plan
         self.in_sets = _in_sets(probe)
-        self._queue = lockstep.LockstepQueue()
         vehicle = plan.vehicle.params
         limits = ControllerLimits(
-            INPUT_LIMITS._replace(radius_m=vehicle.front.wheel.radius_m), None, SupervisionLimits(0.3, 2.0, 0.5, 0.5)
+            input_limits(RECORDED, vehicle.front.wheel.radius_m, by_clock=False), None, supervision_limits(RECORDED)
         )
         table = plan.policies.table(plan.settings.strategy, plan.friction)
         self._controller = Controller(vehicle, WHEEL_NAMES, limits, plan.settings, table, plan.friction)
-        self._last_ns: int | None = None
+        self._lockstep = Lockstep(self._controller, plan.period_s)
+        self._recorded = AsRecorded(self._controller, plan.period_s, _PAUSE_S)
+
+    @property
+    def restarts(self) -> int:
+        """Pauses in the recording, or jumps back, after which the law started anew."""
+        return self._lockstep.restarts + self._recorded.restarts
 
     @property
     def dropped(self) -> dict[str, dict[str, int]]:
@@ -202,7 +177,7 @@ class ReconstructedSteps:
 
     def _push(self, topic: str, content: object, now_ns: int, value: Recorded) -> list[ReplayedStep]:
         """Lock-step: collect a set, step when it is complete."""
-        queue = self._queue
+        queue = self._lockstep.queue
         if topic == DEMAND:
             queue.push_demand(value.publish_time_ns, content)
         elif topic == FRICTION:
@@ -210,18 +185,11 @@ class ReconstructedSteps:
         else:
             kind = {SPEED: lockstep.SPEED, WHEELS: lockstep.WHEELS, BATTERY: lockstep.BATTERY}[topic]
             queue.push(kind, now_ns, value.publish_time_ns, content)
+        before = self._controller.state
         steps = []
-        while (inputs := queue.pop()) is not None:
-            if inputs.demand is None:
-                continue  # the same set once more
-            stamp = inputs.stamp_ns
-            monitor = self._controller.monitor
-            since_s = self._since_s(stamp, longest_s=_INF)
-            monitor.take_speed(inputs.speed, stamp)
-            monitor.take_wheels(inputs.wheels, stamp)
-            monitor.take_battery(inputs.battery, stamp)
-            monitor.take_demand(inputs.demand, 0.0, stamp)
-            steps += self._step(stamp, self._plan.period_s if since_s is None else since_s, value)
+        for taken in self._lockstep.steps():
+            steps += self._replayed(taken, before, value)
+            before = self._controller.state
         return steps
 
     def _use(self, topic: str, content: object, now_ns: int, value: Recorded) -> list[ReplayedStep]:
@@ -235,17 +203,10 @@ class ReconstructedSteps:
             monitor.take_demand(content, 0.0, now_ns)  # type: ignore[arg-type]
         elif topic == FRICTION:
             self._friction(content, now_ns)
-        elif monitor.take_wheels(content, now_ns):  # type: ignore[arg-type]
-            if monitor.tallies[SPEED].accepted_ns is None or monitor.tallies[DEMAND].accepted_ns is None:
-                return []
-            if self._last_ns is not None and now_ns == self._last_ns:
-                return []
-            restarts = self.restarts
-            since_s = self._since_s(now_ns, longest_s=_PAUSE_S)
-            if self.restarts > restarts:
-                self._last_ns = None  # what came before the pause is of no use: wait for speed and demand
-                return []
-            return self._step(now_ns, self._plan.period_s if since_s is None else since_s, value)
+        else:
+            before = self._controller.state
+            taken = self._recorded.step(content, now_ns)
+            return self._replayed(taken, before, value) if taken is not None else []
         return []
 
     def _friction(self, content: object, now_ns: int) -> None:
@@ -254,34 +215,20 @@ class ReconstructedSteps:
             controller.friction = controller.monitor.friction
             controller.policy = self._plan.policies.table(self._plan.settings.strategy, controller.friction)
 
-    def _since_s(self, now_ns: int, longest_s: float) -> float | None:
-        """Time since the last step; None, and the law starts anew, at the first, after a pause, or back in time."""
-        if self._last_ns is None:
-            return None
-        since_s = (now_ns - self._last_ns) / _NS_PER_S
-        if 0.0 < since_s <= longest_s:
-            return since_s
-        self.restarts += 1
-        self._controller.reset()
-        return None
-
-    def _step(self, stamp_ns: int, dt_s: float, value: Recorded) -> list[ReplayedStep]:
-        self._last_ns = stamp_ns
-        controller = self._controller
-        before = controller.state
-        try:
-            command, numbers = controller.step(stamp_ns, dt_s)
-        except ControlFaultError as error:
-            self.faults[str(error)] += 1
-            return []
+    def _replayed(self, taken: Taken, before: ControllerState, value: Recorded) -> list[ReplayedStep]:
+        if taken.fault:
+            self.faults[taken.fault] += 1
+        if taken.step is None:
+            return []  # a fault, or the same set once more
+        command, numbers = taken.step
         return [
             ReplayedStep(
-                stamp_ns,
+                taken.stamp_ns,
                 value.log_time_ns,
                 value.publish_time_ns,
                 command,
-                before,
-                controller.state,
+                before if taken.since_s is not None else initial_state(),
+                self._controller.state,
                 numbers,
             )
         ]

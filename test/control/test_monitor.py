@@ -297,17 +297,31 @@ class TestFriction:
 
 
 class TestCompleteness:
-    def test_it_is_complete_when_every_needed_input_came_once(self, monitor) -> None:
-        taken = (
-            lambda: monitor.take_speed(SpeedReading(NOW, 10.0), NOW),
-            lambda: monitor.take_wheels(wheels(NOW), NOW),
-            lambda: monitor.take_demand(0.0, 0.0, NOW),
+    def test_it_can_drive_when_speed_and_demand_came_once(self, monitor) -> None:
+        for take in (
             lambda: monitor.take_battery(battery(NOW), NOW),
-        )
-        for take in taken:
-            assert not monitor.complete
+            lambda: monitor.take_wheels(wheels(NOW), NOW),
+            lambda: monitor.take_speed(SpeedReading(NOW, 10.0), NOW),
+            lambda: monitor.take_demand(0.0, 0.0, NOW),
+        ):
+            assert not monitor.driven
             take()
-        assert monitor.complete
+        assert monitor.driven
+
+    def test_a_demand_alone_does_not_drive(self, monitor) -> None:
+        monitor.take_demand(0.0, 0.0, NOW)
+        assert not monitor.driven
+
+    def test_forgetting_the_times_keeps_the_values_and_believes_any_next_stamp(self, monitor) -> None:
+        monitor.take_speed(SpeedReading(NOW, 30.0), NOW)
+        monitor.take_wheels(wheels(NOW, (90.0,) * 4), NOW)
+        monitor.take_demand(-9000.0, 0.0, NOW)
+        monitor.take_battery(battery(NOW, 0.9, 40.0), NOW)
+        monitor.forget_times()
+        assert monitor.ages_s(NOW) == (math.inf,) * 4
+        assert (monitor.speed_mps, monitor.demand_w, monitor.demand_speed_mps) == (30.0, -9000.0, 30.0)
+        assert monitor.take_speed(SpeedReading(NOW - 50 * MS, 3.0), NOW - 50 * MS)
+        assert monitor.take_wheels(wheels(NOW - 50 * MS, (90.0,) * 4), NOW - 50 * MS)
 
     def test_forgetting_keeps_the_counters_and_nothing_else(self, monitor) -> None:
         monitor.take_speed(SpeedReading(NOW, 30.0), NOW)
@@ -316,7 +330,7 @@ class TestCompleteness:
         monitor.take_battery(battery(NOW, 0.9, 40.0), NOW)
         monitor.take_friction(0.4, NOW)
         monitor.forget()
-        assert not monitor.complete
+        assert not monitor.driven
         assert monitor.ages_s(NOW) == (math.inf,) * 4
         assert (monitor.speed_mps, monitor.demand_w, monitor.demand_speed_mps, monitor.soc) == (0.0, 0.0, 0.0, 0.5)
         assert monitor.wheel_speed_radps == (0.0,) * 4

@@ -9,6 +9,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
+from iwm_power_manager.control.stepping import RealTime
 from iwm_power_manager.nodes.power_manager import _spin
 from iwm_power_manager.ros.interruption import Interruption
 
@@ -17,16 +18,16 @@ PERIOD_S = 0.01
 
 
 @pytest.fixture
-def stamps(node, monkeypatch):
+def stamps(monkeypatch):
     """When steps were taken, monotonic s."""
     found: list[float] = []
-    take = node._take_step
+    take = RealTime.step
 
-    def noting(*arguments) -> None:
+    def noting(stepper, now_ns):
         found.append(time.monotonic())
-        take(*arguments)
+        return take(stepper, now_ns)
 
-    monkeypatch.setattr(node, "_take_step", noting)
+    monkeypatch.setattr(RealTime, "step", noting)
     return found
 
 

@@ -12,6 +12,7 @@ from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.control.table import empty_table
+from iwm_power_manager.control.thresholds import input_limits, supervision_limits
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros import messages
 from iwm_power_manager.share import resolve
@@ -96,7 +97,10 @@ class TestLockstep:
         vehicle = load_vehicle(resolve(Path("config/vehicles/jalalmaab_2015.yaml"))).params
         values = {spec.name: spec.default for spec in config.SPECS} | {"lockstep": True}
         radius = vehicle.front.wheel.radius_m
-        limits = ControllerLimits(config.input_limits(values, radius), None, config.supervision_limits(values))
+        thresholds = config.thresholds_of(values)
+        limits = ControllerLimits(
+            input_limits(thresholds, radius, by_clock=False), None, supervision_limits(thresholds)
+        )
         twin = Controller(
             vehicle, messages.WHEEL_NAMES, limits, config.law_settings(values, "instantaneous_slip"), empty_table(), 0.9
         )
