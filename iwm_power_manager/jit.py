@@ -1,67 +1,90 @@
 """The one numba decorator of the project.
 
-Numba's on-disk cache only watches the file a function stands in: after an edit to a function it calls, or to a
-constant it imports, it would go on running the old code. So the cache folder carries a hash of every source file of
-both packages: any edit starts a new cache. Arithmetic stays IEEE (no `fastmath`), so that the same step gives the same
-bits whether it is called from Python or inlined into a loop.
+A kernel is compiled when it is first called, so importing one costs nothing and `--help` never waits for a compiler.
+It is compiled in two ways. Called by another kernel, it is only code to be linked into that one. Called from Python, it
+becomes an entry point: with the wrapper that turns Python objects into numbers, and kept on disk (`kernel_cache`). Most
+kernels are never called from Python, and the wrappers around the car's many numbers take longer to compile than the
+kernels.
+
+Arithmetic stays IEEE (no `fastmath`), so that the same step gives the same bits whether it is called from Python or
+inlined into a loop.
 """
 
 from __future__ import annotations
 
-import hashlib
+import functools
 import os
+import threading
+import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar
-
-import numba
-from numba.core import config as numba_config
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+#: Before the first kernel was imported: sources that changed later are not those that run. File systems stamp a change
+#: with a clock that lags by up to a tick.
+STARTED_NS = time.time_ns() - 20_000_000
 
-#: Folders at the edges, which hold no kernel: editing them need not recompile anything.
-KERNEL_FREE = frozenset({"ros", "nodes", "tools", "bags", "study"})
-
-
-def source_hash() -> str:
-    """Hash of every Python source that a kernel can stand in or read a constant from (16 hex digits)."""
-    root = Path(__file__).resolve().parent
-    digest = hashlib.sha256()
-    for package in (root, root.parent / "iwm_sim"):
-        for path in sorted(package.rglob("*.py")):
-            relative = path.relative_to(package.parent)
-            if KERNEL_FREE.isdisjoint(relative.parts):
-                digest.update(str(relative).encode())
-                digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
+_BUILDING = threading.RLock()
 
 
-def cache_folder() -> Path:
-    """Folder of this version's compiled kernels; `IWM_CACHE_DIR` moves it."""
-    base = os.environ.get("IWM_CACHE_DIR") or os.path.join(
-        os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache"), "iwm_power_manager"
-    )
-    return Path(base) / f"numba-{numba.__version__}-{source_hash()}"
+class Kernel:
+    """A function that numba compiles when it is needed.
+
+    Attributes
+    ----------
+    py_func : the function in plain Python
+    releases_lock : it runs without the interpreter's lock
+    """
+
+    def __init__(self, function: Callable[..., Any], releases_lock: bool) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func = function
+        self.releases_lock = releases_lock
+        self._entry: Callable[..., Any] | None = None
+        self._part: Any = None
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        """Run the compiled function."""
+        return (self._entry or self.entry())(*args, **options)
+
+    def entry(self) -> Callable[..., Any]:
+        """The function as Python calls it: numba's dispatcher."""
+        with _BUILDING:
+            if self._entry is None:
+                from iwm_power_manager import compilation
+
+                self._entry = compilation.entry_point(self)
+        return self._entry
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What numba takes it for inside another kernel."""
+        with _BUILDING:
+            if self._part is None:
+                from iwm_power_manager import compilation
+
+                self._part = compilation.part(self)
+        return self._part._numba_type_
+
+    def __reduce__(self) -> str:
+        """Pickled by its name, like any function."""
+        return str(self.py_func.__qualname__)
+
+    def __repr__(self) -> str:
+        """Its full name."""
+        return f"<kernel {self.py_func.__module__}.{self.py_func.__qualname__}>"
 
 
-_CACHE = str(cache_folder())
-
-
-def _compile(function: F, **options: Any) -> F:
-    if not KERNEL_FREE.isdisjoint(function.__module__.split(".")):
-        raise RuntimeError(f"{function.__module__} may hold no kernel: its sources are not part of the cache's key")
-    before = numba_config.CACHE_DIR
-    numba_config.CACHE_DIR = _CACHE
-    try:
-        return numba.njit(cache=True, error_model="numpy", **options)(function)
-    finally:
-        numba_config.CACHE_DIR = before
+def _kernel(function: F, releases_lock: bool) -> F:
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        return function
+    return Kernel(function, releases_lock)  # type: ignore[return-value]
 
 
 def kernel(function: F) -> F:
-    """Compile `function` with numba, cached on disk for exactly this version of the sources."""
-    return _compile(function)
+    """Compile `function` with numba when it is called, kept on disk for exactly these sources."""
+    return _kernel(function, releases_lock=False)
 
 
 def parallel_kernel(function: F) -> F:
@@ -69,4 +92,4 @@ def parallel_kernel(function: F) -> F:
 
     Not for the control law, which would have to wait for the lock after every step.
     """
-    return _compile(function, nogil=True)
+    return _kernel(function, releases_lock=True)

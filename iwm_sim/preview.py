@@ -8,7 +8,6 @@ strategy. The generalized rule (the paper's GRDP) is a straight line fitted to i
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -22,7 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @parallel_kernel
 def _tabulate(power_w, speed_mps, samples, share, friction, dt_s, vehicle, out):
-    for k in numba.prange(out.shape[0]):
+    for k in range(out.shape[0]):
         for u in range(share.size):
             total = 0.0
             for i in range(k * samples, min((k + 1) * samples, power_w.size)):

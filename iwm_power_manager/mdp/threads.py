@@ -7,16 +7,13 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
 
-import numba
-
 #: More ranges than threads, so that one slow range does not leave the other cores idle.
 _RANGES_PER_THREAD = 6
 
 
 @cache
-def _pool() -> ThreadPoolExecutor:
-    # numba's count honours both the process's CPU affinity and NUMBA_NUM_THREADS.
-    return ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, thread_name_prefix="solver")
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="solver")
 
 
 def over_ranges(size: int, function: Callable[[int, int], None]) -> None:
@@ -25,12 +22,15 @@ def over_ranges(size: int, function: Callable[[int, int], None]) -> None:
     `function` calls a `parallel_kernel` whose output in a range depends on nothing written in another one: then the
     result is the same for any number of threads.
     """
-    threads = numba.config.NUMBA_NUM_THREADS
+    from numba import config
+
+    # numba's count honours both the process's CPU affinity and NUMBA_NUM_THREADS.
+    threads = config.NUMBA_NUM_THREADS
     count = min(size, threads * _RANGES_PER_THREAD) if threads > 1 else 1
     if count <= 1:
         function(0, size)
         return
     edges = [size * i // count for i in range(count + 1)]
-    futures = [_pool().submit(function, low, high) for low, high in pairwise(edges)]
+    futures = [_pool(threads).submit(function, low, high) for low, high in pairwise(edges)]
     for future in futures:
         future.result()

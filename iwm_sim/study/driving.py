@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from tqdm import tqdm
 
-from iwm_power_manager import jit
+from iwm_power_manager import kernel_cache
 from iwm_sim.study import cases
 from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result
 
@@ -78,7 +78,7 @@ def _leave_interrupts_to_the_parent() -> None:
 
 def warm_up(wanted: Sequence[Case], say: Callable[[str], None]) -> None:
     """Compile in this process what the workers will then find in the cache, instead of each compiling the same."""
-    if not jit.cache_folder().exists():
+    if kernel_cache.is_empty():
         say("compiling the model; this is done once and takes a minute")
     seen = set()
     for case in wanted:

@@ -6,10 +6,10 @@ import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from iwm_power_manager import jit
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import PolicyError
 from iwm_power_manager.files import read_bytes
+from iwm_power_manager.kernel_cache import cache_folder, sources_hash
 from iwm_power_manager.mdp.demand import chain_of, source_of
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import Policy, choose, load_policy
@@ -110,10 +110,11 @@ def solved(
         It cannot be solved or written.
     """
     grid_file = grid_path(grid)
-    digest = hashlib.sha256(f"{vehicle.hash} {friction!r} {jit.source_hash()}".encode())
+    solver = sources_hash("iwm_power_manager.solve")
+    digest = hashlib.sha256(f"{vehicle.hash} {friction!r} {solver}".encode())
     for file in (grid_file, *map(resolve, cycles)):
         digest.update(read_bytes(file))
-    folder = jit.cache_folder().parent / "policies"
+    folder = cache_folder() / "policies"
     file = folder / f"{digest.hexdigest()[:24]}.npz"
     if not _is_whole(file):
         what = f"solving the policy on grid {grid_file.stem} for friction {friction:g}, idle_drive {vehicle.idle_drive}"

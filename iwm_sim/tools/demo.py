@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from iwm_power_manager import files, jit
+from iwm_power_manager import files, kernel_cache
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
@@ -121,7 +121,7 @@ def run(plan: Plan) -> int:
         ) from None
     vehicle = loaded.vehicle
     print(f"{vehicle.name} on {loaded.cycle.name}, friction {plan.friction:g}, idle drive {vehicle.idle_drive}")
-    if not jit.cache_folder().exists():
+    if kernel_cache.is_empty():
         print("compiling the vehicle model; this is done once and takes a minute")
     alone = closed_loop_run(plan, loaded)
     reference = closed_loop_run(plan, loaded, equal=True)

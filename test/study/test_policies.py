@@ -4,7 +4,6 @@ import shutil
 
 import pytest
 
-from iwm_power_manager import jit
 from iwm_power_manager.errors import IwmError, PolicyError
 from iwm_power_manager.policy import load_policy
 from iwm_sim.study import policies
@@ -17,7 +16,7 @@ VEHICLE = "jalalmaab_2015"
 @pytest.fixture
 def cache(tmp_path, monkeypatch):
     """A user's cache that is empty."""
-    monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path / "cache" / "numba")
+    monkeypatch.setattr(policies, "cache_folder", lambda: tmp_path / "cache")
     return tmp_path / "cache"
 
 

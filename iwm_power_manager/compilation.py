@@ -1,0 +1,127 @@
+"""Kernels through numba: the part of `jit` that needs the compiler."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import llvmlite
+import numba
+from numba.core import config
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
+from numba.core.registry import CPUDispatcher
+from numba.core.serialize import dumps
+from numba.core.types.containers import BaseNamedTuple, BaseTuple
+
+from iwm_power_manager import kernel_cache
+from iwm_power_manager.jit import Kernel
+from iwm_power_manager.kernel_cache import Store, UnknownSourceError
+
+#: What turns a result into Python objects and arguments into numbers is left out: only kernels call it.
+_NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+STORE = Store()
+
+
+class Use(NamedTuple):
+    """An entry point that was needed: its full name, the file it is kept in, and whether that was found."""
+
+    kernel: str
+    file: str
+    found: bool
+
+
+#: Every entry point that this process has needed, in this order.
+USES: list[Use] = []
+
+
+def _options(kernel: Kernel) -> dict[str, Any]:
+    return {"nopython": True, "error_model": "numpy", "nogil": kernel.releases_lock}
+
+
+def part(kernel: Kernel) -> CPUDispatcher:
+    """A kernel as other kernels call it."""
+    return CPUDispatcher(kernel.py_func, targetoptions=_options(kernel) | _NO_WRAPPERS)
+
+
+def entry_point(kernel: Kernel) -> CPUDispatcher:
+    """A kernel as Python calls it."""
+    dispatcher = CPUDispatcher(kernel.py_func, targetoptions=_options(kernel) | {"no_cfunc_wrapper": True})
+    dispatcher._cache = _Cache(kernel)
+    return dispatcher
+
+
+def described(kind: Any) -> str:
+    """A numba type, with the fields of tuples: the class has the same name after a field has moved."""
+    if isinstance(kind, BaseNamedTuple):
+        cls = kind.instance_class
+        fields = ",".join(f"{name}:{described(part)}" for name, part in zip(kind.fields, kind.types, strict=True))
+        return f"{cls.__module__}.{cls.__qualname__}({fields})"
+    if isinstance(kind, BaseTuple):
+        return f"({','.join(map(described, kind.types))})"
+    return repr(kind)
+
+
+def key_of(kernel: Kernel, signature: Sequence[Any], processor: Any) -> str:
+    """Hash of all that a compiled kernel depends on, 32 hex digits.
+
+    Raises
+    ------
+    UnknownSourceError
+        The sources cannot be read.
+    """
+    function = kernel.py_func
+    modules = kernel_cache.reachable_modules(function, lambda value: isinstance(value, Kernel))
+    closure = kernel_cache.import_closure(sorted(modules))
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    if any(not isinstance(cell, Kernel | int | float | str | bool) for cell in cells):
+        raise UnknownSourceError(function.__qualname__)
+    parts = [
+        f"{kernel_cache.environment()} numba {numba.__version__} llvmlite {llvmlite.__version__}",
+        repr((processor, config.OPT, config.BOUNDSCHECK, config.USING_SVML, sorted(_options(kernel).items()))),
+        f"{function.__module__}.{function.__qualname__} {function.__code__.co_code.hex()} {cells!r}",
+        *(f"{name} {closure[name]}" for name in sorted(closure)),
+        *map(described, signature),
+    ]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
+
+
+class _Cache(NullCache):
+    """Compiled entry points of one kernel, on disk."""
+
+    def __init__(self, kernel: Kernel) -> None:
+        self._kernel = kernel
+        self._files: dict[Any, str | None] = {}
+
+    def _file(self, signature: Any, context: Any) -> str | None:
+        if signature not in self._files:
+            name = f"{self._kernel.py_func.__module__}.{self._kernel.py_func.__qualname__}"
+            try:
+                key = key_of(self._kernel, signature, context.codegen().magic_tuple())
+                self._files[signature] = f"{name.replace('<', '').replace('>', '')}-{key}"
+            except (UnknownSourceError, OSError, SyntaxError, UnicodeDecodeError):
+                self._files[signature] = None
+        return self._files[signature]
+
+    def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
+        """The compiled kernel for a signature, or None."""
+        target_context.refresh()
+        file = self._file(sig, target_context)
+        data = STORE.load(file) if file else None
+        result = None
+        if file and data is not None:
+            try:
+                result = CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301 whole, and our own
+            except Exception:  # noqa: BLE001 whatever an unusable file makes of the loader
+                STORE.say_damaged(file)
+        USES.append(Use(repr(self._kernel), file or "", result is not None))
+        return result
+
+    def save_overload(self, sig: Any, data: CompileResult) -> None:
+        """Keep a compiled kernel, if it can be kept."""
+        file = self._files.get(sig)
+        if file and not data.library.has_dynamic_globals and all(lifted.can_cache for lifted in data.lifted):
+            STORE.save(file, dumps(data._reduce()))
