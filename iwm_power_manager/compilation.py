@@ -74,15 +74,16 @@ def key_of(kernel: Kernel, signature: Sequence[Any], processor: Any) -> str:
         The sources cannot be read.
     """
     function = kernel.py_func
-    modules = kernel_cache.reachable_modules(function, lambda value: isinstance(value, Kernel))
-    closure = kernel_cache.import_closure(sorted(modules))
+    reach = kernel_cache.reach(function, lambda value: isinstance(value, Kernel))
+    closure = kernel_cache.import_closure(sorted(reach.modules))
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
     if any(not isinstance(cell, Kernel | int | float | str | bool) for cell in cells):
         raise UnknownSourceError(function.__qualname__)
     parts = [
         f"{kernel_cache.environment()} numba {numba.__version__} llvmlite {llvmlite.__version__}",
         repr((processor, config.OPT, config.BOUNDSCHECK, config.USING_SVML, sorted(_options(kernel).items()))),
-        f"{function.__module__}.{function.__qualname__} {function.__code__.co_code.hex()} {cells!r}",
+        f"{function.__module__}.{function.__qualname__} {cells!r}",
+        reach.code,
         *(f"{name} {closure[name]}" for name in sorted(closure)),
         *map(described, signature),
     ]

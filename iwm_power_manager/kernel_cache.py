@@ -28,6 +28,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from iwm_power_manager.jit import STARTED_NS
@@ -171,30 +172,44 @@ def sources_hash(*modules: str) -> str:
     return hashlib.sha256("".join(f"{name} {closure[name]}\n" for name in sorted(closure)).encode()).hexdigest()[:16]
 
 
-def reachable_modules(function: Callable[..., Any], is_kernel: Callable[[Any], bool]) -> set[str]:
-    """Modules of a kernel and of all kernels it reaches by its globals and cells, also those set at run time."""
-    modules: set[str] = set()
-    seen: set[int] = set()
+class Reach(NamedTuple):
+    """What a kernel can call: the modules that hold it, and the code itself, also where it was made at run time."""
+
+    modules: frozenset[str]
+    code: str
+
+
+def reach(function: Callable[..., Any], is_kernel: Callable[[Any], bool]) -> Reach:
+    """Every kernel that one reaches by its globals and cells, itself included.
+
+    Parameters
+    ----------
+    function : in plain Python
+    is_kernel : tells kernels, which have a `py_func`, from other values
+    """
+    code: dict[str, str] = {}
     waiting: list[Any] = [function]
+    seen: set[int] = set()
     while waiting:
         value = waiting.pop()
+        value = value.py_func if is_kernel(value) else value
         if isinstance(value, tuple):
             waiting += value
-            continue
-        value = value.py_func if is_kernel(value) else value
-        code = getattr(value, "__code__", None)
-        if code is None or id(value) in seen:
+        if not hasattr(value, "__code__") or id(value) in seen:
             continue
         seen.add(id(value))
-        modules.add(value.__module__)
+        made = value.__code__
+        constants = [constant for constant in made.co_consts if not hasattr(constant, "co_code")]
+        code[f"{value.__module__} {value.__qualname__}"] = f"{made.co_code.hex()} {constants!r} {made.co_names!r}"
         waiting += (cell.cell_contents for cell in value.__closure__ or ())
-        for name in code.co_names:
+        for name in made.co_names:
             named = value.__globals__.get(name)
             if isinstance(named, tuple) or is_kernel(named):
                 waiting.append(named)
-            elif getattr(named, "__name__", "").split(".")[0] in PACKAGES:
-                waiting += (item for item in map(vars(named).get, code.co_names) if is_kernel(item))
-    return modules
+            elif isinstance(named, ModuleType):
+                waiting += (item for item in map(vars(named).get, made.co_names) if is_kernel(item))
+    listed = "\n".join(f"{name} {code[name]}" for name in sorted(code))
+    return Reach(frozenset(name.split()[0] for name in code), listed)
 
 
 class Place(NamedTuple):

@@ -109,6 +109,22 @@ def test_fields_that_change_places_in_a_module_the_kernel_does_not_import_make_a
     assert run(toy, tmp_path / "cache")[0] == "60.5 False"
 
 
+def test_a_kernel_that_is_handed_in_while_the_program_runs_counts_with_its_sources(toy, tmp_path) -> None:
+    (toy / "plugin.py").write_text("from iwm_power_manager.jit import kernel\n@kernel\ndef doubled(x):\n    return x\n")
+    code = f"import toy.tyre, plugin; toy.tyre.doubled = plugin.doubled\n{RUN}"
+
+    def result() -> str:
+        command = [sys.executable, "-B", "-c", code]
+        there = environment(toy, tmp_path / "cache")
+        return subprocess.run(command, env=there, capture_output=True, text=True, check=True).stdout.strip()
+
+    assert run(toy, tmp_path / "cache")[0] == "60.5 False"
+    assert result() == "30.5 False"
+    assert result() == "30.5 True"
+    (toy / "plugin.py").write_text((toy / "plugin.py").read_text().replace("return x", "return 3 * x"))
+    assert result() == "90.5 False"
+
+
 def test_another_place_with_the_same_sources_finds_the_kernel_also_in_a_zip_archive(toy, tmp_path) -> None:
     cache = tmp_path / "cache"
     run(toy, cache)
