@@ -45,8 +45,8 @@ DISTRIBUTIONS = {"yaml": "pyyaml"}
 
 #: Parts that know numbers and files only: usable, and tested, where no ROS is.
 ROS_FREE = [
-    "bags", "control", "cycle.py", "errors.py", "files.py", "grid.py", "jit.py", "kernel_cache.py", "compilation.py", "mdp", "model",
-    "policy.py", "replay", "share.py", "signals", "vehicle.py",
+    "bags", "control", "cycle.py", "errors.py", "files.py", "grid.py", "jit.py", "kernel_cache.py",
+    "compilation.py", "mdp", "model", "policy.py", "replay", "share.py", "signals", "vehicle.py",
 ]  # fmt: skip
 
 
