@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import pickle
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Any, NamedTuple
 
-import llvmlite
 import numba
 from numba.core import config
 from numba.core.caching import NullCache
@@ -80,7 +80,7 @@ def key_of(kernel: Kernel, signature: Sequence[Any], processor: Any) -> str:
     if any(not isinstance(cell, Kernel | int | float | str | bool) for cell in cells):
         raise UnknownSourceError(function.__qualname__)
     parts = [
-        f"{kernel_cache.environment()} numba {numba.__version__} llvmlite {llvmlite.__version__}",
+        f"{kernel_cache.environment()} numba {numba.__version__} llvmlite {version('llvmlite')}",
         repr((processor, config.OPT, config.BOUNDSCHECK, config.USING_SVML, sorted(_options(kernel).items()))),
         f"{function.__module__}.{function.__qualname__} {cells!r}",
         reach.code,
