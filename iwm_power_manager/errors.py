@@ -4,9 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
+#: No message gets longer: a hostile file must not fill a terminal or a log.
+MAX_MESSAGE = 1000
+_MAX_PROBLEM = 300
+
+
+def one_line(text: str, limit: int = MAX_MESSAGE) -> str:
+    """A text as one printable line: control characters, line ends and direction marks escaped, cut where too long."""
+    shown = text[: limit + 1]
+    if not shown.isprintable():
+        shown = "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in shown)
+    return shown if len(shown) <= limit else f"{shown[: limit - 3]}..."
+
 
 class IwmError(Exception):
     """Base of every error that is reported to the user as one line, without a traceback."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
 
 
 class ConfigError(IwmError):
@@ -26,7 +41,8 @@ class ConfigError(IwmError):
         self.problem = problem
         self.allowed = allowed
         where = f"{file}: {key}" if key else f"{file}"
-        super().__init__(f"{where}: {problem}" + (f"; allowed: {allowed}" if allowed else ""))
+        shown = one_line(problem, _MAX_PROBLEM)
+        super().__init__(f"{where}: {shown}" + (f"; allowed: {allowed}" if allowed else ""))
 
 
 class PolicyError(IwmError):

@@ -3,6 +3,8 @@
 YAML is read strictly: a key that stands twice, something other than a mapping at the top, or a syntax error are
 refused with the line they stand in. The small checkers below turn a value of a user's file into a number, a name or a
 list, or into one `ConfigError` that says file, key, value and what is allowed.
+
+Files come from strangers: what they may take is bounded here, once for all loaders (docs/files.md).
 """
 
 from __future__ import annotations
@@ -13,7 +15,8 @@ import math
 import os
 import re
 import secrets
-from collections.abc import Iterable, Mapping
+import stat
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,26 +24,64 @@ import yaml
 
 from iwm_power_manager.errors import ConfigError
 
+#: Bytes of a file that is read whole (a policy, counted transitions).
+MAX_FILE_BYTES = 256 * 2**20
+#: Bytes of a CSV or another text.
+MAX_TEXT_BYTES = 64 * 2**20
+#: Bytes of a YAML file, nodes in it with every alias written out, and how deep they may be nested.
+MAX_YAML_BYTES = 256 * 2**10
+MAX_YAML_NODES = 20_000
+MAX_YAML_DEPTH = 32
+#: Characters of a number, in CSV and YAML.
+MAX_NUMBER_LENGTH = 40
+#: Characters of a line of a CSV.
+MAX_LINE_LENGTH = 4096
 
-def read_bytes(path: Path | str) -> bytes:
-    """All bytes of a file; one that is missing or unreadable is a `ConfigError`."""
+_BLOCK = 2**20
+_NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?", re.ASCII)
+_NOT_FINITE = re.compile(r"[-+]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+
+
+def _blocks(path: Path | str) -> Iterator[bytes]:
+    """The bytes of a regular file; a folder, device, pipe or socket is refused before it is read."""
     try:
-        return Path(path).read_bytes()
+        # A pipe without a writer would block here, and a terminal take the process over.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
+        with os.fdopen(descriptor, "rb", buffering=0) as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise ConfigError(path, "", "cannot be read: it is no regular file")
+            while block := file.read(_BLOCK):
+                yield block
     except OSError as error:
         raise ConfigError(path, "", f"cannot be read: {error.strerror or error}") from None
+    except ValueError as error:  # a null character in the path
+        raise ConfigError(path, "", f"cannot be read: {error}") from None
 
 
-def read_text(path: Path | str) -> str:
+def read_bytes(path: Path | str, limit: int = MAX_FILE_BYTES) -> bytes:
+    """All bytes of a regular file; one that is missing, unreadable or too large is a `ConfigError`."""
+    content = bytearray()
+    for block in _blocks(path):
+        content += block
+        if len(content) > limit:
+            raise ConfigError(path, "", "is too large", f"{limit:,} bytes")
+    return bytes(content)
+
+
+def read_text(path: Path | str, limit: int = MAX_TEXT_BYTES) -> str:
     """All text of a UTF-8 file (a byte order mark is skipped); anything else is a `ConfigError`."""
     try:
-        return read_bytes(path).decode("utf-8-sig")
+        return read_bytes(path, limit).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(path, "", f"is not UTF-8 text (byte {error.start})") from None
 
 
 def sha256_of(path: Path | str) -> str:
     """SHA-256 of a file's bytes, 64 hex digits; `ConfigError` if it cannot be read."""
-    return hashlib.sha256(read_bytes(path)).hexdigest()
+    digest = hashlib.sha256()
+    for block in _blocks(path):
+        digest.update(block)
+    return digest.hexdigest()
 
 
 def content_sha256(path: Path | str) -> str:
@@ -104,7 +145,44 @@ def sync_folder(path: Path) -> None:
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Safe loading that refuses a repeated key and reads 1e-3 as a number (plain PyYAML takes it for text)."""
+    """Safe loading that refuses repeated keys and what unfolds without end, and reads numbers as YAML 1.2 writes them.
+
+    Plain PyYAML takes 1e-3 for text, 017 for fifteen, 1_0 for ten and 1:30 for ninety.
+    """
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._open: list[list[int]] = []  # of each node being read: nodes in it so far, depth below it
+        self._sizes: dict[int, tuple[int, int]] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event: Any = self.peek_event()
+        if isinstance(event, yaml.AliasEvent):
+            node = super().compose_node(parent, index)
+            if id(node) not in self._sizes:
+                problem = f"'*{event.anchor}' stands in itself"
+                mark: Any = event.start_mark
+                raise yaml.composer.ComposerError(None, None, problem, mark)
+        else:
+            self._open.append([1, 0])
+            self._bound(0, len(self._open), event)
+            node = super().compose_node(parent, index)
+            nodes, below = self._open.pop()
+            self._sizes[id(node)] = nodes, below + 1
+        nodes, depth = self._sizes[id(node)]
+        if self._open:
+            self._open[-1][0] += nodes
+            self._open[-1][1] = max(self._open[-1][1], depth)
+            nodes = self._open[-1][0]
+        self._bound(nodes, depth + len(self._open), event)
+        return node
+
+    @staticmethod
+    def _bound(nodes: int, depth: int, event: Any) -> None:
+        for value, limit, words in ((nodes, MAX_YAML_NODES, "holds"), (depth, MAX_YAML_DEPTH, "nests")):
+            if value > limit:
+                problem = f"{words} more than {limit} {'values' if words == 'holds' else 'levels'}"
+                raise yaml.composer.ComposerError(None, None, problem, event.start_mark)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -116,10 +194,34 @@ class _StrictLoader(yaml.SafeLoader):
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
 
+    def number(self, node: yaml.ScalarNode) -> float | int:
+        """A number of decimal digits."""
+        text = str(self.construct_scalar(node))
+        if len(text) > MAX_NUMBER_LENGTH:
+            problem = f"a number has {len(text)} characters, more than {MAX_NUMBER_LENGTH}"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+        plain = text.lower().replace(".inf", "inf").replace(".nan", "nan")
+        if not (_NUMBER.fullmatch(plain) or _NOT_FINITE.fullmatch(plain)):
+            raise yaml.constructor.ConstructorError(None, None, f"'{text}' is no number", node.start_mark)
+        return int(plain) if node.tag == _INTEGER_TAG and plain.lstrip("+-").isdigit() else float(plain)
 
+
+_INTEGER_TAG, _FLOAT_TAG = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+_StrictLoader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in (_INTEGER_TAG, _FLOAT_TAG)]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_StrictLoader.add_implicit_resolver(_INTEGER_TAG, re.compile(r"[-+]?(0|[1-9][0-9]*)$"), list("-+0123456789"))
 _StrictLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$"), list("-+0123456789.")
+    _FLOAT_TAG,
+    re.compile(
+        r"([-+]?(\.[0-9]+|[0-9]+\.[0-9]*)([eE][-+]?[0-9]+)?|[-+]?[0-9]+[eE][-+]?[0-9]+"
+        r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN))$"
+    ),
+    list("-+0123456789."),
 )
+for _tag in (_INTEGER_TAG, _FLOAT_TAG):
+    _StrictLoader.add_constructor(_tag, _StrictLoader.number)
 
 
 def read_yaml(path: Path | str) -> dict[str, Any]:
@@ -128,9 +230,10 @@ def read_yaml(path: Path | str) -> dict[str, Any]:
     Raises
     ------
     ConfigError
-        The file is unreadable, is no YAML, repeats a key, or holds something other than a mapping with text keys.
+        The file is unreadable or too large, is no YAML, repeats a key, or holds something other than a mapping with
+        text keys.
     """
-    text = read_text(path)
+    text = read_text(path, MAX_YAML_BYTES)
     try:
         # _StrictLoader is a SafeLoader: it builds plain values only.
         content = yaml.load(text, _StrictLoader)  # noqa: S506
@@ -138,14 +241,47 @@ def read_yaml(path: Path | str) -> dict[str, Any]:
         mark = error.problem_mark or error.context_mark
         where = f"line {mark.line + 1}" if mark else ""
         raise ConfigError(path, where, " ".join((error.problem or "is no YAML").split())) from None
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: an impossible date, for instance
-        raise ConfigError(path, "", f"is no YAML: {' '.join(str(error).split())}") from None
+    except Exception as error:  # noqa: BLE001 - PyYAML's constructors fail in many ways: !!bool maybe is a KeyError
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(path, "", f"is no YAML: {reason}") from None
     if not isinstance(content, dict):
         raise ConfigError(path, "", "holds no mapping", "lines of the form 'key: value'")
     for key in content:
         if not isinstance(key, str):
             raise ConfigError(path, str(key), "is no text key", "names as keys")
     return content
+
+
+def to_number(text: str) -> float:
+    """A number of a table: decimal digits with sign, point and exponent, or nan, inf.
+
+    Raises
+    ------
+    ValueError
+        It is something else (`1_0`, digits of another script, more than `MAX_NUMBER_LENGTH` characters); the message
+        is what is wrong, with a hint where the mistake is a common one.
+    """
+    plain = text.strip()
+    if len(plain) <= MAX_NUMBER_LENGTH and (_NUMBER.fullmatch(plain) or _NOT_FINITE.fullmatch(plain)):
+        return float(plain)
+    raise ValueError(f"'{plain}' is no number" + _hint(plain))
+
+
+def _hint(text: str) -> str:
+    """What is probably meant by a text that is no number."""
+    if len(text) > MAX_NUMBER_LENGTH:
+        return f": it has {len(text)} characters, more than {MAX_NUMBER_LENGTH}"
+    if re.fullmatch(r"[-+]?[0-9.]*,[0-9]+([eE][-+]?[0-9]+)?", text, re.ASCII):
+        return ": a decimal comma? write a point"
+    if any(c in "\u2212\u2010\u2011\u2012\u2013\u2014" for c in text):
+        return ": its sign is a dash; write -"
+    if any(c.isdigit() and not c.isascii() for c in text):
+        return ": write the digits 0 to 9"
+    if re.fullmatch(r"[-+]?[0-9]{1,3}([ '\u00a0\u202f_][0-9]+)+([.,][0-9]+)?", text):
+        return ": write it without separators"
+    if re.match(r"[-+]?[0-9.]+\s*[^\W\d_]", text):
+        return ": write it without a unit"
+    return ""
 
 
 def check_keys(
@@ -194,7 +330,10 @@ def check_number(
     allowed = _range_text(low, high, above, below, unit)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ConfigError(file, key, f"{value!r} is no number", allowed)
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # an integer of hundreds of digits
+        number = math.inf if value > 0 else -math.inf
     if not math.isfinite(number):
         raise ConfigError(file, key, f"{number} is not finite", allowed)
     if number < low or number > high or (above and number == low) or (below and number == high):

@@ -34,9 +34,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iwm_power_manager import __version__
+from iwm_power_manager.archive import read_npz
 from iwm_power_manager.control.table import PolicyTable, as_vector
 from iwm_power_manager.errors import ConfigError, PolicyError
-from iwm_power_manager.files import atomic_write, read_bytes
+from iwm_power_manager.files import atomic_write, check_number
 from iwm_power_manager.mdp.demand import DemandChain, Source
 from iwm_power_manager.mdp.policy_iteration import GATED, Iteration, Solution, expect_over_demand
 from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
@@ -51,7 +52,8 @@ FORMAT_VERSION = 1
 
 _ARRAYS = ("front_share", "cost_j", "demand_probability", "demand_by_speed", "demand_steps")
 _MEMBERS = (*_ARRAYS, "metadata", "checksum")
-_MAX_BYTES = 2**31
+#: Peak friction coefficients a policy may be for.
+FRICTION_RANGE = (0.01, 2.0)
 #: Zip's earliest date: a file's bytes must not depend on when it was written.
 _ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
@@ -256,13 +258,14 @@ def load_policy(path: Path | str) -> Policy:
         It is missing, no policy, damaged, or of another format version; one line says which, and what to do.
     """
     try:
-        data = read_bytes(path)
+        members = read_npz(path, _MEMBERS, "policy file")
     except ConfigError as error:
         raise PolicyError(str(error)) from None
-    members = _read_members(data, path)
+    if "metadata" not in members:
+        raise PolicyError(f"{path}: is no policy file: it holds no metadata")
     raw = members["metadata"].tobytes()
     try:
-        metadata = json.loads(raw)
+        metadata = json.loads(raw, parse_constant=_no_number)
         ours = metadata["format"] == FORMAT_NAME
         version = metadata["format_version"]
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -284,34 +287,8 @@ def load_policy(path: Path | str) -> Policy:
     return _policy_from(arrays, metadata, checksum, path)
 
 
-def _read_members(data: bytes, path: Path | str) -> dict[str, NDArray[Any]]:
-    if not data:
-        raise PolicyError(f"{path}: is empty")
-    if not data.startswith(b"PK\x03\x04"):
-        raise PolicyError(f"{path}: is no policy file")
-    members = {}
-    # Whatever is wrong with the bytes, and zip and npy fail in a dozen ways, it is one thing to the user.
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            entries = [entry for entry in archive.infolist() if entry.filename.removesuffix(".npy") in _MEMBERS]
-            if sum(entry.file_size for entry in entries) > _MAX_BYTES:
-                raise PolicyError(
-                    f"{path}: is damaged or no policy file: it would take more than {_MAX_BYTES:.2g} bytes"
-                )
-            for entry in entries:
-                stream = io.BytesIO(archive.read(entry))
-                array = np.lib.format.read_array(stream, allow_pickle=False)
-                if stream.read(1):
-                    raise ValueError("bytes after the array")
-                members[entry.filename.removesuffix(".npy")] = array
-    except PolicyError:
-        raise
-    except Exception as error:  # noqa: BLE001
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise PolicyError(f"{path}: is damaged or truncated: {reason}") from None
-    if "metadata" not in members:
-        raise PolicyError(f"{path}: is no policy file: it holds no metadata")
-    return members
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is no number")
 
 
 def _other_version(version: Any, metadata: Any, path: Path | str) -> str:
@@ -352,12 +329,11 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
             if np.any(rows < 0.0) or np.any(np.abs(rows.sum(axis=2) - 1.0) > 1e-9):
                 raise PolicyError(f"{path}: a row of {name} is no distribution")
         solver = metadata["solver"]
-        chain = DemandChain(
-            problem.power_w, probability, by_speed, arrays["demand_steps"], float(metadata["demand"]["clipped"])
-        )
+        clipped = check_number(path, "clipped", metadata["demand"]["clipped"], 0.0, 1.0)
+        chain = DemandChain(problem.power_w, probability, by_speed, arrays["demand_steps"], clipped)
         return Policy(
             problem=problem,
-            friction=float(metadata["friction"]),
+            friction=check_number(path, "friction", metadata["friction"], *FRICTION_RANGE),
             front_share=arrays["front_share"],
             cost_j=arrays["cost_j"],
             chain=chain,
@@ -366,14 +342,14 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
             idle_drive=str(metadata["vehicle"]["idle_drive"]),
             sources=tuple(metadata["demand"]["sources"]),
             iterations=tuple(Iteration(*row) for row in solver["iterations"]),
-            bound_j=float(solver["bound_j"]),
+            bound_j=check_number(path, "bound_j", solver["bound_j"], 0.0),
             converged=bool(solver["converged"]),
             package_version=str(metadata["package_version"]),
             checksum=checksum,
         )
     except ConfigError as error:
         raise PolicyError(str(error)) from None
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise PolicyError(f"{path}: its metadata is incomplete: {error!r}") from None
 
 

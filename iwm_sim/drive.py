@@ -9,17 +9,17 @@ from __future__ import annotations
 import io
 import json
 import math
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from iwm_power_manager.archive import read_npz
 from iwm_power_manager.control.types import Wheels
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import atomic_write, read_bytes
+from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.driver import DriverState, Pedals, drive, sample
 from iwm_power_manager.model.pedals import full_braking_w
 from iwm_power_manager.vehicle import Vehicle
@@ -222,14 +222,14 @@ def save_run(path: Path | str, run: Run, notes: Mapping[str, Any] | None = None)
 
 def load_run(path: Path | str) -> tuple[Run, dict[str, Any]]:
     """Read the run and the notes that `save_run` wrote; `ConfigError` if the file is something else."""
+    content = read_npz(path, ("columns", "dt_s", "series", "final", "notes"), "recorded run")
     try:
-        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as content:
-            if tuple(content["columns"]) != COLUMNS:
-                raise ConfigError(path, "columns", "are those of another version", ", ".join(COLUMNS))
-            leaves = iter(content["final"].tolist())
-            run = Run(float(content["dt_s"]), content["series"], _rebuild(plant.PlantState, leaves))
-            return run, json.loads(str(content["notes"]))
-    except (zipfile.BadZipFile, EOFError, KeyError, TypeError, ValueError, StopIteration):
+        if tuple(content["columns"]) != COLUMNS:
+            raise ConfigError(path, "columns", "are those of another version", ", ".join(COLUMNS))
+        leaves = iter(content["final"].tolist())
+        run = Run(float(content["dt_s"]), content["series"], _rebuild(plant.PlantState, leaves))
+        return run, json.loads(str(content["notes"]))
+    except (KeyError, TypeError, ValueError, StopIteration, RecursionError):
         raise ConfigError(path, "", "is no recorded run") from None
 
 

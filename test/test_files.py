@@ -9,7 +9,7 @@ import os
 import pytest
 
 from iwm_power_manager import files
-from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.errors import ConfigError, PolicyError
 
 
 def test_a_write_replaces_the_file_and_leaves_nothing_else(tmp_path):
@@ -149,3 +149,131 @@ def test_integers_choices_and_switches_are_checked():
         files.check_choice("f", "k", ["a"], ("a", "b"))
     with pytest.raises(ConfigError, match="'yes' is neither true nor false"):
         files.check_bool("f", "k", "yes")
+
+
+# --- What strangers send ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "/dev/null", "/proc/self", "."])
+def test_only_regular_files_are_read(name):
+    with pytest.raises(ConfigError, match="cannot be read"):
+        files.read_bytes(name)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        files.sha256_of(name)
+
+
+def test_a_pipe_without_a_writer_does_not_block(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ConfigError, match="it is no regular file"):
+        files.read_text(tmp_path / "pipe")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        files.read_text("null\0character")
+
+
+def test_a_file_beyond_its_limit_is_refused_and_one_at_it_is_read(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_bytes(b"x" * 100)
+    assert len(files.read_bytes(path, 100)) == 100
+    with pytest.raises(ConfigError, match="is too large; allowed: 99 bytes"):
+        files.read_text(path, 99)
+    path.write_bytes(b"#" * (files.MAX_YAML_BYTES + 1))
+    with pytest.raises(ConfigError, match="is too large"):
+        files.read_yaml(path)
+
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join(['*' + before] * 10)}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+CHAIN = "a0: &a0 [x]\n" + "".join(f"a{i}: &a{i} [*a{i - 1}]\n" for i in range(1, 60))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (BOMB, "holds more than 20000 values"),
+        (CHAIN, "nests more than 32 levels"),
+        ("a: " + "[" * 5000 + "]" * 5000, "nests more than 32 levels"),
+        ("a: " + "{b: " * 5000 + "1" + "}" * 5000, "nests more than 32 levels"),
+        ("a: &a [*a]\n", "'*a' stands in itself"),
+        ("a: &a {b: *a}\n", "'*a' stands in itself"),
+        ("a: *b\n", "undefined alias"),
+        ("a: !!bool maybe\n", "is no YAML"),
+        ("a: !!int maybe\n", "'maybe' is no number"),
+        ("a: !!int 1_0\n", "'1_0' is no number"),
+        ("a: !!float ''\n", "'' is no number"),
+        ("a: !!timestamp now\n", "is no YAML"),
+        ("a: " + "9" * 400, "a number has 400 characters, more than 40"),
+        ("a: 1" + "0" * 5000, "a number has 5001 characters"),
+        ("? [a, b]\n: 1\n", ""),
+        ("a: \x07\n", "unacceptable character"),
+    ],
+)
+def test_hostile_yaml_is_refused_in_one_line(tmp_path, text, words):
+    path = tmp_path / "car.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        files.read_yaml(path)
+    assert words in str(caught.value)
+    assert str(caught.value).isprintable()
+
+
+def test_aliases_may_be_used_with_measure(tmp_path):
+    path = tmp_path / "car.yaml"
+    path.write_text("a: &a {x: 1, y: [2, 3]}\nb: *a\nc: {<<: *a, x: 4}\n")
+    assert files.read_yaml(path) == {"a": {"x": 1, "y": [2, 3]}, "b": {"x": 1, "y": [2, 3]}, "c": {"x": 4, "y": [2, 3]}}
+
+
+@pytest.mark.parametrize("text", ["1_0", "017", "0x10", "0b1", "1:30", "1,5", "\u0661\u0660", "--1", "+-1"])
+def test_what_yaml_1_1_or_python_would_take_for_a_number_is_text(tmp_path, text):
+    path = tmp_path / "car.yaml"
+    path.write_text(f"a: {text}\n")
+    assert files.read_yaml(path) == {"a": text}
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("0", 0), ("-12", -12), ("+.5", 0.5), (".inf", math.inf), ("-.inf", -math.inf)]
+)
+def test_numbers_of_yaml_keep_their_kind(tmp_path, text, value):
+    path = tmp_path / "car.yaml"
+    path.write_text(f"a: {text}\n")
+    found = files.read_yaml(path)["a"]
+    assert (found, type(found)) == (value, type(value))
+
+
+@pytest.mark.parametrize("text", ["1", "-1.5", " .5 ", "+2.", "1e-3", "1E5", "nan", "-inf", "Infinity"])
+def test_numbers_of_a_table_are_read(text):
+    assert repr(files.to_number(text)) == repr(float(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "'' is no number"),
+        ("fast", "'fast' is no number"),
+        ("1_0", "'1_0' is no number: write it without separators"),
+        ("1 000", "write it without separators"),
+        ("0,5", "a decimal comma? write a point"),
+        ("\u22125", "its sign is a dash; write -"),
+        ("\u0661\u0660", "write the digits 0 to 9"),
+        ("50 km/h", "write it without a unit"),
+        ("0x10", "is no number"),
+        ("1" * 41, "it has 41 characters, more than 40"),
+    ],
+)
+def test_what_is_no_number_is_refused_with_a_hint(text, words):
+    with pytest.raises(ValueError) as caught:
+        files.to_number(text)
+    assert words in str(caught.value)
+
+
+def test_a_huge_integer_is_out_of_range_and_no_traceback():
+    with pytest.raises(ConfigError, match="f: k: -inf is not finite"):
+        files.check_number("f", "k", -(10**400))
+
+
+def test_a_message_is_one_printable_line_of_bounded_length():
+    error = ConfigError("a\nb.yaml", "key\x1b[31m", "x" * 10_000 + "\u202e", "1\r2")
+    assert str(error).isprintable()
+    assert str(error).startswith(r"a\nb.yaml: key\x1b[31m: xxx")
+    assert str(error).endswith(r"...; allowed: 1\r2")
+    assert len(str(PolicyError("y" * 10_000))) == 1000

@@ -6,7 +6,6 @@ import dataclasses
 import io
 import itertools
 import json
-import zipfile
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from iwm_power_manager import archive
 from iwm_power_manager import policy as policy_module
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.errors import PolicyError
@@ -245,12 +245,8 @@ def test_another_project_s_npz_is_refused(tmp_path_factory):
 
 
 def test_an_object_array_is_not_unpickled(content, tmp_path_factory):
-    output = io.BytesIO(content)
-    pickled = io.BytesIO()
-    np.lib.format.write_array(pickled, np.array([{}], dtype=object), allow_pickle=True)
-    with pytest.warns(UserWarning, match="Duplicate"), zipfile.ZipFile(output, "a") as archive:
-        archive.writestr("cost_j.npy", pickled.getvalue())
-    assert "Object arrays cannot be loaded" in _load(tmp_path_factory, output.getvalue())
+    objects = {"cost_j": np.array([{}], dtype=object)}
+    assert "cost_j.npy holds objects" in _load(tmp_path_factory, _rebuilt(content, arrays=objects, sign=False))
 
 
 def test_an_older_format_says_to_solve_again(content, tmp_path_factory):
@@ -306,8 +302,23 @@ def test_arrays_that_cannot_be_right_are_refused_even_with_a_right_checksum(
 
 
 def test_a_file_that_would_unpack_to_gigabytes_is_refused(content, tmp_path_factory, monkeypatch):
-    monkeypatch.setattr(policy_module, "_MAX_BYTES", 1000)
-    assert "would take more than" in _load(tmp_path_factory, content)
+    monkeypatch.setattr(archive, "MAX_ARRAY_BYTES", 1000)
+    assert "bytes, more than 1,000" in _load(tmp_path_factory, content)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: m.update(friction=float("nan")), "its metadata cannot be read"),
+        (lambda m: m.update(friction=1e9), "friction: 1000000000.0 is out of range"),
+        (lambda m: m.update(friction="0.5"), "friction: '0.5' is no number"),
+        (lambda m: m.update(friction=10**400), "friction: inf is not finite"),
+        (lambda m: m["solver"].update(bound_j=-1.0), "bound_j: -1.0 is out of range"),
+        (lambda m: m["demand"].update(clipped=2.0), "clipped: 2.0 is out of range"),
+    ],
+)
+def test_numbers_of_the_metadata_are_checked(content, tmp_path_factory, change, words):
+    assert words in _load(tmp_path_factory, _rebuilt(content, change))
 
 
 def test_a_bank_is_sorted_by_friction_and_chosen_by_ratio(tmp_path):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
+import math
 from bisect import bisect_left
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,14 +18,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iwm_power_manager import __version__
+from iwm_power_manager.archive import read_npz
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import atomic_write, read_bytes, sha256_of
+from iwm_power_manager.files import atomic_write, sha256_of
 from iwm_power_manager.mdp.demand import Source
+from iwm_power_manager.mdp.problem import MAX_AXIS_POINTS
 
 FORMAT_NAME = "iwm_power_manager demand transitions"
 FORMAT_VERSION = 1
 _MEMBERS = ("metadata", "power_w", "speed_mps", "cells", "counts")
 _NS_PER_S = 1_000_000_000
+#: Cells of a table of counts, and transitions in it (six years at 0.2 s): beyond, a file is no log of driving.
+MAX_CELLS = 20_000_000
+MAX_TRANSITIONS = 1_000_000_000
+#: Transitions that are walked through one by one; where there are more, each stands for several.
+_MAX_STEPS = 5_000_000
 
 
 class DemandTransitions(NamedTuple):
@@ -146,14 +153,12 @@ def load_transitions(path: Path | str) -> DemandTransitions:
     ConfigError
         It is missing, no such file, damaged, or of another version.
     """
-    data = read_bytes(path)
+    members = read_npz(path, _MEMBERS, "file of demand transitions")
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            members = {name: archive[name] for name in _MEMBERS}
         metadata = json.loads(members["metadata"].tobytes())
         ours = metadata["format"] == FORMAT_NAME
         version = metadata["format_version"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, NotImplementedError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise ConfigError(path, "", "is no file of demand transitions, or a damaged one") from None
     if not ours:
         raise ConfigError(path, "format", f"{metadata['format']!r} is unknown", FORMAT_NAME)
@@ -161,7 +166,7 @@ def load_transitions(path: Path | str) -> DemandTransitions:
         raise ConfigError(path, "format_version", f"{version!r} cannot be read", str(FORMAT_VERSION))
     try:
         return _checked(members, metadata)
-    except (ValueError, KeyError, TypeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
         raise ConfigError(path, "", f"is damaged: {error}") from None
 
 
@@ -169,7 +174,9 @@ def _checked(members: dict[str, NDArray[Any]], metadata: dict[str, Any]) -> Dema
     axes = []
     for name in ("power_w", "speed_mps"):
         axis = members[name]
-        if axis.dtype != np.float64 or axis.ndim != 1 or axis.size < 1 or not np.all(np.isfinite(axis)):
+        if axis.dtype != np.float64 or axis.ndim != 1 or not 1 <= axis.size <= MAX_AXIS_POINTS:
+            raise ValueError(f"{name} is no axis of 1 to {MAX_AXIS_POINTS} points")
+        if not np.all(np.isfinite(axis)):
             raise ValueError(f"{name} is no axis")
         if np.any(np.diff(axis) <= 0.0):
             raise ValueError(f"{name} does not rise")
@@ -183,6 +190,8 @@ def _checked(members: dict[str, NDArray[Any]], metadata: dict[str, Any]) -> Dema
         raise ValueError("cells and counts do not fit each other")
     if np.any(counts < 1) or np.any(cells < 0) or np.any(cells >= shape):
         raise ValueError("a cell or a count is out of range")
+    if math.prod(shape) > MAX_CELLS or float(counts.sum(dtype=np.float64)) > MAX_TRANSITIONS:
+        raise ValueError(f"it has more than {MAX_CELLS:.0e} cells or {MAX_TRANSITIONS:.0e} transitions")
     table = np.zeros(shape, dtype=np.int64)
     np.add.at(table, tuple(cells.T), counts)
     return DemandTransitions(axes[0], axes[1], dt_s, table, clipped)
@@ -201,11 +210,12 @@ def transitions_source(path: Path | str, dt_s: float, weight: float = 1.0) -> So
         raise ConfigError(path, "dt_s", f"{transitions.dt_s:g} s is not the grid's step", f"{dt_s:g} s")
     if not transitions.total:
         raise ConfigError(path, "counts", "holds no transition yet")
-    walks = walk_through(transitions.counts)
+    each = -(-transitions.total // _MAX_STEPS)
+    walks = walk_through(-(-transitions.counts // each))
     return Source(
         Path(path).name,
         sha256_of(path),
-        weight,
+        weight * each,
         tuple(transitions.power_w[bins] for bins, _ in walks),
         tuple(transitions.speed_mps[speeds] for _, speeds in walks),
     )

@@ -124,7 +124,7 @@ def test_a_damaged_run_is_refused_by_name(tmp_path, driven, damage):
     path = tmp_path / "run.npz"
     save_run(path, driven.run())
     path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(ConfigError, match=r"run\.npz: is no recorded run"):
+    with pytest.raises(ConfigError, match=r"run\.npz: is (no recorded run|empty|damaged)"):
         load_run(path)
 
 
