@@ -21,6 +21,7 @@ from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.driver import DriverState, Pedals, Trace, drive, sample
 from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.pedals import pedal_power_w
 from iwm_power_manager.model.tyre import slip_ratio
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import plant
@@ -84,19 +85,21 @@ COLUMNS = Row._fields
 
 
 class Noise(NamedTuple):
-    """Errors of the sensors, added to each sample; empty arrays mean none.
+    """Errors of sensors and foot, added to each sample; empty arrays mean none.
 
     Attributes
     ----------
     speed_mps : (n,)
     wheel_radps : (n, 4)
+    pedal : (n,), part of the travel of the pedal in use
     """
 
-    speed_mps: FloatArray
-    wheel_radps: FloatArray
+    speed_mps: FloatArray = np.zeros(0)
+    wheel_radps: FloatArray = np.zeros((0, 4))
+    pedal: FloatArray = np.zeros(0)
 
 
-NO_NOISE = Noise(np.zeros(0), np.zeros((0, 4)))
+NO_NOISE = Noise()
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,6 +258,17 @@ def row_of(
 
 
 @kernel
+def shaken(pedals: Pedals, travel: float, speed_mps: float, vehicle: VehicleParams) -> Pedals:
+    """The pedal in use, pressed further by a part of its travel, inside its range."""
+    accelerator, brake = pedals.accelerator, pedals.brake
+    if brake > 0.0:
+        brake = min(max(brake + travel, 0.0), 1.0)
+    else:
+        accelerator = min(max(accelerator + travel, 0.0), 1.0)
+    return Pedals(accelerator, brake, pedal_power_w(accelerator, brake, speed_mps, vehicle))
+
+
+@kernel
 def _loop(
     trace: Trace,
     car: plant.PlantState,
@@ -289,6 +303,8 @@ def _loop(
             dt_s,
             vehicle,
         )
+        if noise.pedal.size > 0:
+            pedals = shaken(pedals, noise.pedal[k], car.speed_mps, vehicle)
         measurement = measure(car, pedals.power_demand_w, dt_s, assumed_friction, speed_error, wheel_error, vehicle)
         command, controller = law.step(measurement, controller, settings, vehicle, policy)
         before = car

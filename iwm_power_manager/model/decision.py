@@ -16,7 +16,7 @@ from iwm_power_manager.model.gate import axle_gated, gated_split
 from iwm_power_manager.model.limits import battery_scale, car_power_w
 from iwm_power_manager.model.longitudinal import step
 from iwm_power_manager.model.motor import idle_drag_nm, torque_limit_nm
-from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
 from iwm_power_manager.model.torque import blend, conversion_speed_radps
 from iwm_power_manager.model.tyre import slip_ratio
@@ -107,9 +107,9 @@ def axles_gated(power_w: float, slip_front: float, slip_rear: float, problem: Pr
 
 
 @kernel
-def wheel_speed_of_state(slip: float, speed_mps: float, vehicle: VehicleParams) -> float:
+def wheel_speed_of_state(slip: float, speed_mps: float, axle: Axle) -> float:
     """Wheel speed, rad/s, at a slip as `tyre.slip_ratio` defines it, its floor at rest included."""
-    floor = vehicle.front.tyre.slip_speed_floor_mps
+    floor = axle.tyre.slip_speed_floor_mps
     if slip > 0.0:
         bounded = min(slip, SPINNING_SLIP)
         rim = speed_mps / (1.0 - bounded)
@@ -117,7 +117,7 @@ def wheel_speed_of_state(slip: float, speed_mps: float, vehicle: VehicleParams) 
             rim = speed_mps + bounded * floor
     else:
         rim = max(speed_mps + slip * max(speed_mps, floor), 0.0)
-    return rim / vehicle.front.wheel.radius_m
+    return rim / axle.wheel.radius_m
 
 
 @kernel
@@ -179,14 +179,13 @@ def _dynamic_step(
     vehicle: VehicleParams,
     problem: ProblemParams,
 ) -> Step:
-    radius = vehicle.front.wheel.radius_m
     motor = vehicle.front.motor
     battery = vehicle.battery
     dt = problem.dt_s
     gate_front, gate_rear = axles_gated(power_demand_w, slip_front, slip_rear, problem)
     power_front, power_rear = gated_split(power_demand_w, front_share, gate_front, gate_rear)
-    front_speed = wheel_speed_of_state(slip_front, speed_mps, vehicle)
-    rear_speed = wheel_speed_of_state(slip_rear, speed_mps, vehicle)
+    front_speed = wheel_speed_of_state(slip_front, speed_mps, vehicle.front)
+    rear_speed = wheel_speed_of_state(slip_rear, speed_mps, vehicle.rear)
 
     front_motor, front_friction, front_short = _axle_torque(power_front, front_speed, speed_mps, vehicle, problem)
     rear_motor, rear_friction, rear_short = _axle_torque(power_rear, rear_speed, speed_mps, vehicle, problem)
@@ -201,12 +200,12 @@ def _dynamic_step(
         rear_motor -= cut_rear
         if power_demand_w < 0.0:
             front_friction = max(front_friction + cut_front, -vehicle.front.friction_brake.max_torque_nm)
-            rear_friction = max(rear_friction + cut_rear, -vehicle.front.friction_brake.max_torque_nm)
+            rear_friction = max(rear_friction + cut_rear, -vehicle.rear.friction_brake.max_torque_nm)
         else:
             shortfall += 2.0 * (cut_front * front_speed + cut_rear * rear_speed)
 
-    drag_front = idle_drag_nm(front_motor, front_speed, motor)
-    drag_rear = idle_drag_nm(rear_motor, rear_speed, motor)
+    drag_front = idle_drag_nm(front_motor, front_speed, vehicle.front.motor)
+    drag_rear = idle_drag_nm(rear_motor, rear_speed, vehicle.rear.motor)
     resisting_front = drag_front - front_friction
     resisting_rear = drag_rear - rear_friction
     motion = step(
@@ -234,12 +233,14 @@ def _dynamic_step(
         # the power at the wheels.
         inertia_force = (equivalent_mass_kg(vehicle) - vehicle.chassis.mass_kg) * (motion.speed_mps - speed_mps) / dt
         delivered = (2.0 * (motion.tyre_force_n[0] + motion.tyre_force_n[2]) + inertia_force) * speed_mean
-    floor = vehicle.front.tyre.slip_speed_floor_mps
+    front, rear = vehicle.front, vehicle.rear
     return Step(
         chemical_power_w(electrical, battery) * dt + error_cost_j(power_demand_w, delivered, problem),
         motion.speed_mps,
-        slip_ratio(motion.wheel_speed_radps[0], motion.speed_mps, radius, floor),
-        slip_ratio(motion.wheel_speed_radps[2], motion.speed_mps, radius, floor),
+        slip_ratio(
+            motion.wheel_speed_radps[0], motion.speed_mps, front.wheel.radius_m, front.tyre.slip_speed_floor_mps
+        ),
+        slip_ratio(motion.wheel_speed_radps[2], motion.speed_mps, rear.wheel.radius_m, rear.tyre.slip_speed_floor_mps),
         shortfall,
     )
 

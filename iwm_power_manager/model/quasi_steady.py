@@ -12,7 +12,7 @@ from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, normal_forces_n, road_load_n
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
-from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.model.tyre import peak_ratio, slip_at_friction, wheel_speed_at_slip
 
 #: Part of the peak friction a strategy plans with. The rest is the distance the slip limiter keeps from the peak.
@@ -21,17 +21,17 @@ USABLE_FRICTION = 0.99
 
 @kernel
 def axle_power_w(
-    force_n: float, speed_mps: float, normal_n: float, friction: float, slip_aware: bool, vehicle: VehicleParams
+    force_n: float, speed_mps: float, normal_n: float, friction: float, slip_aware: bool, axle: Axle
 ) -> float:
     """Electrical power of an axle's two motors, W, for the axle's road force (braking negative).
 
     Braking beyond the regeneration limit is friction's and brings nothing.
     """
-    radius = vehicle.front.wheel.radius_m
-    motor = vehicle.front.motor
+    radius = axle.wheel.radius_m
+    motor = axle.motor
     slip = 0.0
     if slip_aware and normal_n > 0.0:
-        slip = slip_at_friction(0.5 * force_n / normal_n, friction, vehicle.front.tyre)
+        slip = slip_at_friction(0.5 * force_n / normal_n, friction, axle.tyre)
     wheel_speed = wheel_speed_at_slip(slip, speed_mps, radius)
     torque = 0.5 * force_n * radius
     if torque < 0.0:
@@ -58,22 +58,25 @@ def split_power_w(
     battery power (W, eq. 21), missing force (N, >= 0)
     """
     chassis = vehicle.chassis
-    radius = vehicle.front.wheel.radius_m
-    motor = vehicle.front.motor
-    rolling_speed = speed_mps / radius
+    front_radius = vehicle.front.wheel.radius_m
+    rear_radius = vehicle.rear.wheel.radius_m
+    front_motor = vehicle.front.motor
+    rear_motor = vehicle.rear.motor
+    front_rolling = speed_mps / front_radius
+    rear_rolling = speed_mps / rear_radius
     acceleration = (force_n - road_load_n(speed_mps, 0.0, chassis)) / equivalent_mass_kg(vehicle)
     normal_front, normal_rear = normal_forces_n(acceleration, speed_mps, 0.0, chassis)
 
     front = front_share * force_n
     rear = force_n - front
-    # An idle axle's drag is a force too; the working axle has to overcome it.
-    drag = 2.0 * idle_drag_nm(0.0, rolling_speed, motor) / radius
     if front == 0.0 and rear == 0.0:
-        return chemical_power_w(4.0 * electrical_power_w(0.0, rolling_speed, motor), vehicle.battery), 0.0
+        idle_w = electrical_power_w(0.0, front_rolling, front_motor) + electrical_power_w(0.0, rear_rolling, rear_motor)
+        return chemical_power_w(2.0 * idle_w, vehicle.battery), 0.0
+    # An idle axle's drag is a force too; the working axle has to overcome it.
     if front == 0.0:
-        rear += drag
+        rear += 2.0 * idle_drag_nm(0.0, front_rolling, front_motor) / front_radius
     elif rear == 0.0:
-        front += drag
+        front += 2.0 * idle_drag_nm(0.0, rear_rolling, rear_motor) / rear_radius
     sign = 1.0 if force_n > 0.0 else -1.0
     need_front = max(sign * front, 0.0)
     need_rear = max(sign * rear, 0.0)
@@ -81,21 +84,20 @@ def split_power_w(
     room_front = 1e12
     room_rear = 1e12
     if slip_aware:
-        grip = 2.0 * USABLE_FRICTION * friction * peak_ratio(vehicle.front.tyre)
-        room_front = grip * normal_front
-        room_rear = grip * normal_rear
+        grip = 2.0 * USABLE_FRICTION * friction
+        room_front = grip * peak_ratio(vehicle.front.tyre) * normal_front
+        room_rear = grip * peak_ratio(vehicle.rear.tyre) * normal_rear
     if sign > 0.0:
-        motors = 2.0 * torque_limit_nm(rolling_speed, 0.0, motor) / radius
-        room_front = min(room_front, motors)
-        room_rear = min(room_rear, motors)
+        room_front = min(room_front, 2.0 * torque_limit_nm(front_rolling, 0.0, front_motor) / front_radius)
+        room_rear = min(room_rear, 2.0 * torque_limit_nm(rear_rolling, 0.0, rear_motor) / rear_radius)
     given_front = min(need_front, room_front)
     given_rear = min(need_rear + need_front - given_front, room_rear)
     given_front = min(need_front + need_rear - given_rear, room_front)
     missing = need_front + need_rear - given_front - given_rear
 
-    power = axle_power_w(sign * given_front, speed_mps, normal_front, friction, slip_aware, vehicle) + axle_power_w(
-        sign * given_rear, speed_mps, normal_rear, friction, slip_aware, vehicle
-    )
+    power = axle_power_w(
+        sign * given_front, speed_mps, normal_front, friction, slip_aware, vehicle.front
+    ) + axle_power_w(sign * given_rear, speed_mps, normal_rear, friction, slip_aware, vehicle.rear)
     return chemical_power_w(power, vehicle.battery), missing
 
 
@@ -106,7 +108,8 @@ def demand_force_n(
     """Road force a power demand at the wheels stands for, N: torque by eq. 16 with its speed floor, both axles alike.
 
     A wheel that slips turns faster than it rolls, so that the same power is less torque: a tenth less near the grip of
-    a slippery road. Without `slip_aware` the wheels roll.
+    a slippery road. Without `slip_aware` the wheels roll. Where the axles' tyres differ, the front one's slip counts:
+    what a demand means must not depend on the split.
     """
     floor = vehicle.driver.power_speed_floor_mps
     force = power_demand_w / max(speed_mps, floor)

@@ -7,15 +7,15 @@ Cycles
 ------
 A Markov chain of (speed, acceleration, target speed) with a step of 1 s. The target is held for a random time and then
 drawn anew, 0 (a stop) among its values; the acceleration follows the distance to the target with a random part and
-inside what traffic uses; the speed integrates it. A cycle's character, from town to motorway, is drawn once: it sets the
-targets' levels, how long they last and how often they are a stop. The grade is an Ornstein-Uhlenbeck process over the
-distance, between flat country and hills by cycle.
+inside what traffic uses; the speed integrates it. A cycle's character, from town to motorway, is drawn once: it sets
+the targets' levels, how long they last and how often they are a stop. The grade is an Ornstein-Uhlenbeck process over
+the distance, between flat country and hills by cycle.
 
 Cars
 ----
 Mass is drawn between 350 and 2800 kg, evenly in its logarithm; power, torque and frontal area follow with a spread.
-Losses have the shape of the package's motor, scaled to the motor's size, each term with its own factor; some cars have a
-map instead. Half of the cars have different motors in front and at the rear.
+Losses have the shape of the package's motor, scaled to the motor's size, each term with its own factor; some cars have
+a map instead. Half of the cars have different motors in front and at the rear.
 
 Logged noise
 ------------
@@ -24,6 +24,8 @@ Logged noise
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -41,12 +43,22 @@ KMH = 1.0 / 3.6
 LOG_PERIOD_S = 0.1
 LOG_RESOLUTION_MPS = 0.1 * KMH
 
-# Town and motorway, between which a cycle's character lies: target speeds (mean and spread, m/s), how long a target
-# holds (s), how likely the next one is a stop, how long a stop lasts (s).
-_TOWN = (9.0, 4.0, 12.0, 0.45, 18.0)
-_MOTORWAY = (29.0, 4.0, 45.0, 0.03, 10.0)
 _TOP_SPEED_MPS = 36.0
 _CORRELATION_LENGTH_M = 400.0
+
+
+class _Character(NamedTuple):
+    """What a cycle's chain is made of: target speeds, how long they and stops last, how likely the next is a stop."""
+
+    mean_mps: float
+    spread_mps: float
+    hold_s: float
+    stop: float
+    standstill_s: float
+
+
+_TOWN = _Character(9.0, 4.0, 12.0, 0.45, 18.0)
+_MOTORWAY = _Character(29.0, 4.0, 45.0, 0.03, 10.0)
 
 
 def cycle(seed: int, duration_s: int = 300) -> Cycle:
@@ -58,10 +70,9 @@ def cycle(seed: int, duration_s: int = 300) -> Cycle:
     duration_s : length; the last seconds brake to a stop
     """
     random = np.random.default_rng([1, seed])
-    character = random.uniform()
-    mean, spread, hold, stop, standstill = (
-        (1.0 - character) * town + character * motorway for town, motorway in zip(_TOWN, _MOTORWAY, strict=True)
-    )
+    part = random.uniform()
+    between = ((1.0 - part) * town + part * motorway for town, motorway in zip(_TOWN, _MOTORWAY, strict=True))
+    character = _Character(*between)
     eagerness = random.uniform(0.6, 1.3)  # of the driver: factor on all accelerations
     jitter = random.uniform(0.05, 0.25)
     speed = np.zeros(duration_s + 1)
@@ -70,9 +81,7 @@ def cycle(seed: int, duration_s: int = 300) -> Cycle:
         v = speed[k]
         left -= 1.0
         if left <= 0.0 and (target > 0.0 or v < 0.1):
-            stops = target > 0.0 and random.uniform() < stop
-            target = 0.0 if stops else min(max(mean + spread * random.standard_normal(), 3.0), _TOP_SPEED_MPS)
-            left = random.exponential(standstill) + 2.0 if stops else random.exponential(hold) + 4.0
+            target, left = _next_target(random, character, target)
         if v * 1.6 / eagerness + 2.0 >= duration_s - k:  # time to come to rest
             target, left = 0.0, np.inf
         most = eagerness * 1.6 / (1.0 + (v / 15.0) ** 2) + 0.15
@@ -84,6 +93,14 @@ def cycle(seed: int, duration_s: int = 300) -> Cycle:
             acceleration = 0.0
     speed[-2:] = 0.0
     return make_cycle(f"generated_{seed}", np.arange(duration_s + 1.0), speed, _grade(random, speed))
+
+
+def _next_target(random: np.random.Generator, character: _Character, target_mps: float) -> tuple[float, float]:
+    """Target speed after this one, and how long it is to hold."""
+    if target_mps > 0.0 and random.uniform() < character.stop:
+        return 0.0, random.exponential(character.standstill_s) + 2.0
+    drawn = character.mean_mps + character.spread_mps * random.standard_normal()
+    return min(max(drawn, 3.0), _TOP_SPEED_MPS), random.exponential(character.hold_s) + 4.0
 
 
 def _grade(random: np.random.Generator, speed_mps: FloatArray) -> FloatArray:
@@ -167,14 +184,16 @@ def _chassis(base: Chassis, mass_kg: float, random: np.random.Generator) -> Chas
     size = mass_kg / base.mass_kg
     wheelbase = 1.7 + 1.2 * min(mass_kg / 2400.0, 1.0)
     front_weight = random.uniform(0.35, 0.65)
+    front, rear = wheelbase * (1.0 - front_weight), wheelbase * front_weight
     return base._replace(
         mass_kg=mass_kg,
         frontal_area_m2=base.frontal_area_m2 * size ** (1.0 / 3.0),
         drag_coefficient=random.uniform(0.24, 0.42),
         rolling_resistance=random.uniform(0.007, 0.013),
-        front_axle_to_cg_m=wheelbase * (1.0 - front_weight),
-        rear_axle_to_cg_m=wheelbase * front_weight,
+        front_axle_to_cg_m=front,
+        rear_axle_to_cg_m=rear,
         cg_height_m=wheelbase * random.uniform(0.18, 0.3),
+        yaw_inertia_kgm2=mass_kg * front * rear,
     )
 
 

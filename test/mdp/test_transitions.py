@@ -144,7 +144,7 @@ def test_a_gated_axle_gets_nothing_and_the_share_does_not_matter():
 @given(st.floats(0.0, 30.0), st.floats(-1.0, 1.0))
 def test_a_state_s_wheel_speed_has_the_state_s_slip(speed, slip):
     tyre, radius = CAR.params.front.tyre, CAR.params.front.wheel.radius_m
-    wheel_speed = wheel_speed_of_state(slip, speed, CAR.params)
+    wheel_speed = wheel_speed_of_state(slip, speed, CAR.params.front)
     assert wheel_speed >= 0.0
     found = slip_ratio(wheel_speed, speed, radius, tyre.slip_speed_floor_mps)
     rolls_backwards = speed + slip * max(speed, tyre.slip_speed_floor_mps) < 0.0

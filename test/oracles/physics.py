@@ -77,15 +77,15 @@ def regeneration_limit(wheel, speed, heat, motor):
     return float(faded) * min(motor.regeneration_torque_nm, torque_limit(wheel, heat, motor))
 
 
-def axle_w(force, speed, normal, friction, slip_aware, vehicle):
+def axle_w(force, speed, normal, friction, slip_aware, axle):
     """Electrical power of an axle's motors for its road force, slip settled."""
-    radius = vehicle.front.wheel.radius_m
-    s = slip_for(0.5 * force / normal, friction, vehicle.front.tyre) if slip_aware and normal > 0.0 else 0.0
+    radius = axle.wheel.radius_m
+    s = slip_for(0.5 * force / normal, friction, axle.tyre) if slip_aware and normal > 0.0 else 0.0
     wheel = (speed / (1.0 - s) if s > 0.0 else speed * (1.0 + s)) / radius
     torque = 0.5 * force * radius
     if torque < 0.0:
-        torque = max(torque, -regeneration_limit(wheel, speed, 0.0, vehicle.front.motor))
-    return 2.0 * electrical_w(torque, wheel, vehicle.front.motor)
+        torque = max(torque, -regeneration_limit(wheel, speed, 0.0, axle.motor))
+    return 2.0 * electrical_w(torque, wheel, axle.motor)
 
 
 def battery_w(power, battery):

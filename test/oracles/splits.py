@@ -14,29 +14,35 @@ TELLS_APART_W = 1e-3
 
 def split_w(force, speed, share, friction, slip_aware, vehicle):
     """Battery power for a road force at a share, and the force nobody can give."""
-    car, motor, radius = vehicle.chassis, vehicle.front.motor, vehicle.front.wheel.radius_m
-    rolling = speed / radius
+    car, axles = vehicle.chassis, (vehicle.front, vehicle.rear)
+    rolling = [speed / axle.wheel.radius_m for axle in axles]
     if force == 0.0:
-        return battery_w(4.0 * electrical_w(0.0, rolling, motor), vehicle.battery), 0.0
-    mass = car.mass_kg + 4.0 * vehicle.front.wheel.inertia_kgm2 / radius**2
+        idle = sum(electrical_w(0.0, w, axle.motor) for w, axle in zip(rolling, axles, strict=True))
+        return battery_w(2.0 * idle, vehicle.battery), 0.0
+    mass = car.mass_kg + sum(2.0 * axle.wheel.inertia_kgm2 / axle.wheel.radius_m**2 for axle in axles)
     normal = normal_forces((force - road_load(speed, 0.0, car)) / mass, speed, 0.0, car)
     direction = 1.0 if force > 0.0 else -1.0
     asked = [share * force, force - share * force]
     if 0.0 in asked:
         idle = asked.index(0.0)
+        motor = axles[idle].motor
         if motor.idle_drive == 1:
-            drag = motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * rolling
-            asked[1 - idle] += 2.0 * drag / radius
+            drag = motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * rolling[idle]
+            asked[1 - idle] += 2.0 * drag / axles[idle].wheel.radius_m
     asked = [max(direction * x, 0.0) for x in asked]
-    room = [0.99 * 2.0 * friction * vehicle.front.tyre.coefficients[2] * n if slip_aware else 1e12 for n in normal]
-    if direction > 0.0:
-        room = [min(x, 2.0 * torque_limit(rolling, 0.0, motor) / radius) for x in room]
+    room = [1e12, 1e12]
+    for i, axle in enumerate(axles):
+        if slip_aware:
+            room[i] = 0.99 * 2.0 * friction * axle.tyre.coefficients[2] * normal[i]
+        if direction > 0.0:
+            room[i] = min(room[i], 2.0 * torque_limit(rolling[i], 0.0, axle.motor) / axle.wheel.radius_m)
     given = [min(a, r) for a, r in zip(asked, room, strict=True)]
     for axle in (1, 0):
         short = sum(asked) - sum(given)
         given[axle] += min(max(short, 0.0), room[axle] - given[axle])
     power = sum(
-        axle_w(direction * f, speed, n, friction, slip_aware, vehicle) for f, n in zip(given, normal, strict=True)
+        axle_w(direction * f, speed, n, friction, slip_aware, axle)
+        for f, n, axle in zip(given, normal, axles, strict=True)
     )
     return battery_w(power, vehicle.battery), sum(asked) - sum(given)
 
