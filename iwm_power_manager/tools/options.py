@@ -10,6 +10,9 @@ from typing import Any
 from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.errors import ConfigError
 
+#: An option that takes several values, however they are given: `--cycle A B` or `--cycle A --cycle B`. Nothing is [].
+several: Any = {"action": "extend", "nargs": "+", "default": []}
+
 
 def number(low: float, high: float) -> Callable[[str], float]:
     """Argument type of a number in a range."""

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.figure import Figure
 from scipy.optimize import minimize, minimize_scalar
 
 from iwm_power_manager.control.settings import default_settings
@@ -31,7 +32,7 @@ from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import Battery
 from iwm_power_manager.vehicle import nominal_voltage_v, with_params
 from iwm_sim import closed_loop
-from iwm_sim.study import cases, figures
+from iwm_sim.study import cases
 from iwm_sim.study.cases import Case
 
 FloatArray = npt.NDArray[np.float64]
@@ -225,9 +226,9 @@ def check_picture(path: str) -> str:
     return kind
 
 
-def save_picture(made: Fit, path: str) -> None:
-    """Fig. 7 as an SVG or PNG file."""
+def save_picture(figure: Figure, path: str) -> None:
+    """A figure as an SVG or PNG file."""
     kind = check_picture(path)
     stream = io.BytesIO()
-    figures.model_comparison(*made.comparison).savefig(stream, format=kind, dpi=150, facecolor="white")
+    figure.savefig(stream, format=kind, dpi=150, facecolor="white")
     atomic_write(path, stream.getvalue())

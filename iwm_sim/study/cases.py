@@ -115,6 +115,12 @@ class Case:
         return self.label or self.strategy
 
     @property
+    def price_text(self) -> str:
+        """What a change of the share costs strategy `preview`."""
+        fixed = f" + {self.switching_fixed_cost_j:g} J for any change" if self.switching_fixed_cost_j else ""
+        return f"{self.switching_cost_j:g} J a move{fixed}"
+
+    @property
     def told_friction(self) -> float:
         """Friction the law assumes."""
         return self.friction if self.assumed_friction is None else self.assumed_friction
@@ -234,6 +240,14 @@ def known_in_advance(case: Case, vehicle: Vehicle, until_s: float = np.inf) -> t
         case.switching_fixed_cost_j,
     )
     return equal, schedule
+
+
+def priced_as(case: Case, policy: str) -> Case:
+    """A case whose changes of the share have the price they have in a policy."""
+    problem = policy_of(policy).problem
+    return dataclasses.replace(
+        case, switching_cost_j=problem.switching_cost_j, switching_fixed_cost_j=problem.switching_fixed_cost_j
+    )
 
 
 class Rule(NamedTuple):

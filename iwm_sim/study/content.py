@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from iwm_power_manager.files import read_text
+from iwm_sim.study.ablation import Ablated
 from iwm_sim.study.battery_fit import Estimate
+from iwm_sim.study.cases import Case, cycle_of
 from iwm_sim.study.criteria import Criterion
 from iwm_sim.study.paper import Consequences
 from iwm_sim.study.rows import Row
@@ -95,6 +97,7 @@ class Study:
     sensitivity: dict[str, dict[str, float]]
     paper: Consequences
     criteria: list[Criterion]
+    ablation: list[Ablated]
     format: int = FORMAT
 
     def to_json(self) -> bytes:
@@ -121,6 +124,7 @@ class Study:
                 "robustness": [Robustness(**row) for row in values["robustness"]],
                 "battery_fit": {name: Estimate(**made) for name, made in values["battery_fit"].items()},
                 "paper": Consequences(**values["paper"]),
+                "ablation": [Ablated(**row) for row in values["ablation"]],
                 "criteria": [Criterion(**row) for row in values["criteria"]],
             }
         )
@@ -152,3 +156,12 @@ def rounded(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(f"{value:.6g}") if np.isfinite(value) else None
     return value
+
+
+def frontier_of(base: Case, rows: Sequence[Row]) -> Frontier:
+    """The frontier of `plan.frontier`'s rows."""
+    points = []
+    for row in rows:
+        family, price = row.label.split("|")
+        points.append(FrontierPoint(family, price, row.saving_percent, row.metrics.share_changes_per_min))
+    return Frontier(cycle_of(base.cycle).name, base.friction, points)

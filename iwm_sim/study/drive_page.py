@@ -67,10 +67,10 @@ class DriveRow:
 
 COLUMNS: tuple[Column[DriveRow], ...] = (
     Column("Strategy", lambda row: row.strategy),
-    Column("Distance", lambda row: row.metrics.distance_m / 1000.0, "km", 3),
+    Column("Saving", lambda row: row.saving_percent, "%", 2),
     Column("Energy", lambda row: row.metrics.wh_per_km, "Wh/km", 2, best="low"),
     Column("ΔSoC", lambda row: row.metrics.delta_soc_percent, "%", 3, best="low"),
-    Column("Saving", lambda row: row.saving_percent, "%", 2),
+    Column("Distance", lambda row: row.metrics.distance_m / 1000.0, "km", 3),
     Column("RMS speed error", lambda row: row.metrics.rms_speed_error_mps, "m/s", 3),
     Column("Lowest slip", lambda row: row.metrics.min_slip, decimals=3),
     Column("Highest slip", lambda row: row.metrics.max_slip, decimals=3),
@@ -148,8 +148,8 @@ def _tiles(row: DriveRow, other: DriveRow) -> list[Tile]:
     name, metrics, beside = other.strategy, row.metrics, other.metrics
     slips = f"{shown(metrics.min_slip, 3)} … {shown(metrics.max_slip, 3)}"
     return [
-        Tile("Energy", shown(metrics.wh_per_km, 2), "Wh/km", f"{name}: {shown(beside.wh_per_km, 2)}"),
         Tile("Saving", shown(row.saving_percent, 2), "%", f"against {name}"),
+        Tile("Energy", shown(metrics.wh_per_km, 2), "Wh/km", f"{name}: {shown(beside.wh_per_km, 2)}"),
         Tile("ΔSoC", shown(metrics.delta_soc_percent, 3), "%", f"{name}: {shown(beside.delta_soc_percent, 3)}"),
         Tile(
             "Distance", shown(metrics.distance_m / 1000.0, 3), "km", f"{name}: {shown(beside.distance_m / 1000.0, 3)}"
@@ -165,7 +165,7 @@ def _panels(driven: Driven, reference: Driven, critical_slip: float) -> list[Pan
         Panel(
             "Speed",
             "m/s",
-            [Series("car", run["speed_mps"], BLUE, wide=True), Series("cycle", run["trace_mps"], BLACK, dashed=True)],
+            [Series("cycle", run["trace_mps"], OCHRE, wide=True), Series("car", run["speed_mps"], BLUE)],
         ),
         Panel(
             "Power",

@@ -141,3 +141,12 @@ class Progress:
         case = result.case
         self._bar.set_postfix_str(f"{cases.cycle_of(case.cycle).name} {case.friction:g} {case.name}")
         self._bar.update()
+
+
+def tell(line: str) -> None:
+    """Say something beside a bar."""
+    tqdm.write(line, file=sys.stderr)
+
+
+def silent(_: str) -> None:
+    """Say nothing."""

@@ -53,6 +53,10 @@ _STYLE: dict[str, Any] = {
 }
 
 
+#: What the zoomed part of the frontier shows, percentage points below the best.
+_ZOOM_POINTS = 0.25
+
+
 class Curve(NamedTuple):
     """Battery depletion over the front axle's power.
 
@@ -154,22 +158,23 @@ def depletion_over_split_panels(panels: Sequence[tuple[str, Sequence[Curve]]]) -
 
 
 @_styled
-def policy_convergence(policy_change_w: ArrayLike, bellman_residual: ArrayLike | None = None) -> Figure:
+def policy_convergence(policy_change: ArrayLike, bellman_residual: ArrayLike | None = None) -> Figure:
     """Fig. 12: how policy iteration converges.
 
     Parameters
     ----------
-    policy_change_w : (K,) norm of the change of the policy in each iteration, W; zeros are drawn on the axis' floor
+    policy_change : (K,) norm over all states of the change of the front share in each iteration; zeros are drawn on
+        the axis' floor
     bellman_residual : (K,) largest change of the cost-to-go, on an axis of its own; None leaves it out
     """
-    change = np.asarray(policy_change_w, dtype=np.float64)
+    change = np.asarray(policy_change, dtype=np.float64)
     iteration = np.arange(1, len(change) + 1)
     figure, axes = _axes(1 if bellman_residual is None else 2, height_in=3.2 if bellman_residual is None else 4.8)
     axes[0].plot(iteration, change, "o-", color=BLUE, markersize=4)
     # Linear below the smallest change: the last iteration changes nothing, and a log axis has no zero.
     positive = change[change > 0.0]
     axes[0].set_yscale("symlog", linthresh=float(positive.min()) if len(positive) else 1.0)
-    axes[0].set_ylabel("Change of the policy, W")
+    axes[0].set_ylabel("Change of the policy, share")
     if bellman_residual is not None:
         axes[1].semilogy(iteration, bellman_residual, "s-", color=VERMILION, markersize=4)
         axes[1].set_ylabel("Bellman residual")
@@ -292,47 +297,24 @@ def transition_matrix(probability: ArrayLike, power_w: ArrayLike) -> Figure:
 
 @_styled
 def switching_frontier(families: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> Figure:
-    """Saving over changes of the front share a minute: for each strategy, (changes, saving in %) along its price."""
-    figure, (axis,) = _axes(1, height_in=3.6)
-    for index, (name, (changes, saving)) in enumerate(families.items()):
-        axis.plot(changes, saving, "os^Dv"[index % 5] + "-", color=COLOURS[index % 6], markersize=4, label=name)
-    axis.set_xscale("symlog", linthresh=1.0)
-    axis.set_xlim(left=0.0)
-    axis.set_xlabel("Changes of the front share, 1/min")
-    axis.set_ylabel("Saving against equal split, %")
-    axis.legend(loc="lower right")
-    return figure
+    """Saving over changes of the front share a minute: for each strategy, (changes, saving in %) along its price.
 
-
-@_styled
-def bars_by_cycle(
-    cycles: Sequence[str],
-    values: Mapping[str, Sequence[float]],
-    label: str,
-    valid: Mapping[str, Sequence[bool]] | None = None,
-) -> Figure:
-    """A group of bars for each cycle, a bar for each strategy; runs that are not valid are hatched.
-
-    Parameters
-    ----------
-    cycles : names of the groups
-    values : by strategy, a value for each cycle (NaN: none)
-    label : of the axis, with unit
-    valid : by strategy, whether each value may be compared
+    Above what matters, the last quarter of a point; below everything.
     """
-    figure, (axis,) = _axes(1, height_in=3.4)
-    width = 0.82 / max(1, len(values))
-    for index, (name, heights) in enumerate(values.items()):
-        x = np.arange(len(cycles)) + (index - (len(values) - 1) / 2) * width
-        bars = axis.bar(x, heights, width * 0.92, color=COLOURS[index % 7], label=name)
-        for bar, good in zip(bars, valid[name] if valid else (), strict=False):
-            if not good:
-                bar.set(fill=False, hatch="////", edgecolor=COLOURS[index % 7])
-    axis.axhline(0.0, color=INK, linewidth=0.8)
-    axis.set_xticks(range(len(cycles)), cycles)
-    axis.grid(visible=False, axis="x")
-    axis.set_ylabel(label)
-    axis.legend(ncols=min(4, len(values)), loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    figure, axes = _axes(2, height_in=5.4, share_x=False)
+    best = max((max(saving) for _, saving in families.values()), default=0.0)
+    near: list[float] = []
+    for index, (name, (changes, saving)) in enumerate(families.items()):
+        for axis in axes:
+            axis.plot(changes, saving, "os^Dv"[index % 5] + "-", color=COLOURS[index % 6], markersize=4, label=name)
+        near += [x for x, y in zip(changes, saving, strict=True) if y > best - _ZOOM_POINTS]
+    if near:
+        axes[0].set_xlim(min(near) - 0.5, max(near) + 0.5)
+        axes[0].set_ylim(best - _ZOOM_POINTS, best + 0.1 * _ZOOM_POINTS)
+    for axis in axes:
+        axis.set_ylabel("Saving, %")
+    axes[1].set_xlabel("Changes of the front share, 1/min")
+    axes[0].legend(loc="lower right")
     return figure
 
 

@@ -1,21 +1,19 @@
-"""The study as one HTML page, as Markdown and as pictures."""
+"""The study as one HTML page, as Markdown and as pictures: answers first, then the tables with their figures."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
-
-import numpy as np
 
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write, read_text
+from iwm_sim.study.answers import WORDS, answers
 from iwm_sim.study.content import Study
-from iwm_sim.study.labels import OURS
-from iwm_sim.study.report import Block, Page, Picture, Pictures, Settings, Table, Text, Tile, Tiles, write_page
-from iwm_sim.study.report import format_value as shown
+from iwm_sim.study.report import Block, Page, Picture, Pictures, Settings, Table, Text, write_page
 from iwm_sim.study.study_figures import Drawn
-from iwm_sim.study.study_tables import IDLE_DRIVES, tables
+from iwm_sim.study.study_tables import TableOf, tables
 from iwm_sim.study.tables import markdown_table
 
 #: What a document holds between these lines is generated.
@@ -30,12 +28,12 @@ def write(output: Path, study: Study, pictures: Sequence[Drawn]) -> None:
         stream = io.BytesIO()
         picture.figure.savefig(stream, format="svg", facecolor="white", metadata={"Date": None})
         atomic_write(output / "figures" / f"{picture.file}.svg", stream.getvalue())
-    atomic_write(output / "study.md", (f"# {TITLE}\n\n{lead(study)}\n\n{markdown(study)}\n").encode())
+    atomic_write(output / "study.md", f"# {TITLE}\n\n{markdown(study)}\n".encode())
     write_page(output / "study.html", page(study, pictures))
 
 
 def update_document(path: Path, study: Study) -> None:
-    """Replace what stands between the markers of a Markdown file by a study's tables.
+    """Replace what stands between the markers of a Markdown file by a study's answers and tables.
 
     Raises
     ------
@@ -47,63 +45,44 @@ def update_document(path: Path, study: Study) -> None:
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise ConfigError(path, "", "has no place for generated tables", f"the lines {BEGIN} and {END}")
-    atomic_write(path, f"{before}{begin}\n\n{lead(study)}\n\n{markdown(study)}\n\n{end}{after}".encode())
+    atomic_write(path, f"{before}{begin}\n\n{markdown(study)}\n\n{end}{after}".encode())
 
 
-def savings(study: Study, idle_drive: str) -> list[float]:
-    """What our policy saves with an idle drive, %, in every cell whose trace was held."""
-    return [
-        row.saving_percent
-        for row in study.cells
-        if row.label == OURS
-        and row.place.idle_drive == idle_drive
-        and row.metrics.trace_held
-        and row.saving_percent is not None
-    ]
-
-
-def lead(study: Study) -> str:
-    """The sentence to take away."""
-    parts = [
-        f"{min(saved):.2f} to {max(saved):.2f} % (mean {np.mean(saved):.2f} %) with idle drive {idle_drive}"
-        for idle_drive in IDLE_DRIVES
-        if (saved := savings(study, idle_drive))
-    ]
-    met = sum(criterion.met for criterion in study.criteria)
-    return (
-        f"Against equal split, our policy saves {' and '.join(parts)}; {met} of {len(study.criteria)} criteria are met."
-    )
+def sections(study: Study) -> Iterator[tuple[str, list[TableOf]]]:
+    """Tables by section."""
+    for name, found in groupby(tables(study), lambda table: table.section):
+        yield name, list(found)
 
 
 def markdown(study: Study) -> str:
-    """All tables in Markdown."""
-    parts = []
-    section = ""
-    for table in tables(study):
-        if table.section != section:
-            section = table.section
-            parts.append(f"## {section}")
-            if table.note:
-                parts.append(table.note)
-        if table.title:
-            parts.append(f"**{table.title}**")
-        parts.append(markdown_table(table.rows, table.columns))
+    """Answers and all tables in Markdown, with the command that makes each."""
+    parts = [f"**{made.question}** {made.answer}" for made in answers(study)]
+    for name, found in sections(study):
+        parts.append(f"## {name}")
+        if found[0].note:
+            parts.append(found[0].note)
+        for table in found:
+            parts += [f"**{table.title}**"] if table.title else []
+            parts.append(markdown_table(table.rows, table.columns))
+        commands = list(dict.fromkeys(table.command for table in found if table.command))
+        parts.append(f"Made by {' and '.join(f'`{command}`' for command in commands or ['make study'])}.")
     return "\n\n".join(parts)
 
 
 def page(study: Study, pictures: Sequence[Drawn]) -> Page:
     """The study as a page."""
-    blocks: list[Block] = [Tiles(_tiles(study))]
-    section = ""
-    for table in tables(study):
-        title = table.section if table.section != section else ""
-        section = table.section
-        if title and table.title:
-            blocks.append(Text(table.note or table.title, title))
-            blocks.append(Table(table.title, table.columns, table.rows))
-        else:
-            blocks.append(Table(title or table.title, table.columns, table.rows, "" if table.title else table.note))
-    blocks.append(Pictures("Figures", [Picture(made.title, made.figure, made.note) for made in pictures]))
+    first, *others = answers(study)
+    blocks: list[Block] = [Text(made.answer, made.question) for made in (first, *others)]
+    for name, found in sections(study):
+        blocks.append(Text(found[0].note, name))
+        blocks += [Table("", table.columns, table.rows, caption=table.title) for table in found]
+        near = [made for made in pictures if made.section == name]
+        if near:
+            blocks.append(Pictures("", [Picture(made.title, made.figure, made.note) for made in near]))
+    rest = [made for made in pictures if made.section not in {name for name, _ in sections(study)}]
+    if rest:
+        blocks.append(Pictures("Other figures", [Picture(made.title, made.figure, made.note) for made in rest]))
+    blocks.append(Settings("Words", WORDS))
     blocks.append(
         Settings(
             "Settings",
@@ -116,22 +95,5 @@ def page(study: Study, pictures: Sequence[Drawn]) -> Page:
             },
         )
     )
-    return Page(TITLE, lead(study), blocks)
-
-
-def _tiles(study: Study) -> list[Tile]:
-    ours = [row.metrics for row in study.cells if row.label == OURS]
-    tiles = []
-    for idle_drive in IDLE_DRIVES:
-        saved = savings(study, idle_drive)
-        mean = shown(float(np.mean(saved)) if saved else None, 2)
-        tiles.append(Tile(f"Saving, idle drive {idle_drive}", mean, "%", f"{len(saved)} cells, against equal split"))
-    changes = max(metrics.share_changes_per_min for metrics in ours)
-    locked = max(metrics.longest_locked_s for metrics in ours)
-    longer = max(stop.longer_percent for stop in study.stops if stop.gate_mode == "limiter")
-    return [
-        *tiles,
-        Tile("Front share", shown(changes, 1), "/ min", "changes at most"),
-        Tile("Beyond −0.2 slip", shown(locked, 2), "s", "at a stretch, at most"),
-        Tile("Emergency stop", shown(longer, 1), "%", "longer than the best, at worst"),
-    ]
+    lead = "One car, four cycles, three roads, two readings of what an idle axle costs; every number is simulated."
+    return Page(TITLE, lead, blocks, contents=True)

@@ -31,13 +31,13 @@ class PolicySource:
     Parameters
     ----------
     path : folder (searched with its subfolders) or policy file
-    grid : of a policy that has to be solved
+    grid : of the policies that count; "" takes any of a folder's, and solves a missing one on `DEFAULT_GRID`
     may_solve : False makes a missing policy an error
     say : told, in one line, of everything that is solved
     """
 
     def __init__(
-        self, path: str, grid: str = DEFAULT_GRID, may_solve: bool = True, say: Callable[[str], None] = lambda _: None
+        self, path: str, grid: str = "", may_solve: bool = True, say: Callable[[str], None] = lambda _: None
     ) -> None:
         self._path = resolve(path)
         self._given = path
@@ -60,15 +60,25 @@ class PolicySource:
         if self._path.is_file():
             ((file, policy),) = bank.items()
             policy.check_vehicle(vehicle, file)
+            if not self._is_on_grid(policy):
+                raise PolicyError(f"{file}: was solved on grid {policy.problem.name}, not on {self._grid}")
             return file
-        fitting = {file: policy for file, policy in bank.items() if policy.vehicle_hash == vehicle.hash}
+        fitting = {
+            file: policy
+            for file, policy in bank.items()
+            if policy.vehicle_hash == vehicle.hash and self._is_on_grid(policy)
+        }
         if fitting:
             best = choose(list(fitting.values()), friction)
             return next(file for file, policy in fitting.items() if policy is best)
-        problem = f"{self._given}: holds no policy for '{vehicle.name}' with idle_drive {vehicle.idle_drive}"
+        on_grid = f" on grid {self._grid}" if self._grid else ""
+        problem = f"{self._given}: holds no policy for '{vehicle.name}' with idle_drive {vehicle.idle_drive}{on_grid}"
         if not self._may_solve:
             raise PolicyError(f"{problem}; solve one with solve_policy")
-        return solved(vehicle, friction, self._grid, self._say, because=problem)
+        return solved(vehicle, friction, self._grid or DEFAULT_GRID, self._say, because=problem)
+
+    def _is_on_grid(self, policy: Policy) -> bool:
+        return not self._grid or policy.problem.name == grid_path(self._grid).stem
 
     def _load(self) -> dict[str, Policy]:
         if self._bank is None:

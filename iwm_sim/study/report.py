@@ -99,13 +99,14 @@ class Column[R]:
 
 @dataclass(frozen=True)
 class Table[R]:
-    """Rows under columns; one that is not `valid` is greyed and never the best."""
+    """Rows under columns; one that is not `valid` is greyed and never the best. `caption` is a smaller heading."""
 
     title: str
     columns: Sequence[Column[R]]
     rows: Sequence[R]
     note: str = ""
     valid: Callable[[R], bool] = lambda _: True
+    caption: str = ""
 
     def is_best(self, column: Column[R], row: R) -> bool:
         """Whether a row's value is the best of a column that has one."""
@@ -247,6 +248,7 @@ class Page:
     ----------
     title, lead : what the page is, and the one sentence to take away
     blocks : its parts, in order
+    contents : whether a list of its headings comes first
     valid : None, or whether the run it shows may be used, with `verdict` saying why
     """
 
@@ -255,6 +257,7 @@ class Page:
     blocks: Sequence[Block]
     valid: bool | None = None
     verdict: str = ""
+    contents: bool = False
 
 
 @functools.cache

@@ -10,13 +10,18 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.policy import Policy
 from iwm_sim.metrics import CRITICAL_SLIP
 from iwm_sim.study import battery_fit, figures, sensitivity
-from iwm_sim.study.cases import Rule
+from iwm_sim.study.cases import Result, Rule
 from iwm_sim.study.content import Frontier
 from iwm_sim.study.labels import ED, GATE_OFF, OURS
+from iwm_sim.study.study_tables import BATTERY, FRONTIER, PROGRAM, SENSITIVITY, TABLE_6, TABLES
 
 FloatArray = npt.NDArray[np.float64]
+
+#: When Figures 14 and 15 look.
+WINDOW_S = (345.0, 430.0)
 
 
 class Material(NamedTuple):
@@ -38,12 +43,13 @@ class Material(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """A figure with the name of its file."""
+    """A figure with the name of its file, and the section of the study it belongs to."""
 
     file: str
     title: str
     note: str
     figure: Figure
+    section: str = ""
 
 
 def drawn(frontier: Frontier, material: Material, vehicle: VehicleParams) -> list[Drawn]:
@@ -65,6 +71,7 @@ def battery_figure(fit: battery_fit.Fit) -> Drawn:
         "Figure 7: plant and control model",
         "Speed and state of charge, equal split; the control model has a static circuit, fitted.",
         figures.model_comparison(*fit.comparison),
+        BATTERY,
     )
 
 
@@ -76,6 +83,7 @@ def depletion_figures(vehicle: VehicleParams) -> list[Drawn]:
             "Figure 8: depletion over the split, by speed",
             f"Demand {sensitivity.FIG_8_DEMAND_W / 1000:g} kW, both slips 0.01.",
             figures.depletion_over_split(sensitivity.figure_8(vehicle)),
+            SENSITIVITY,
         ),
         Drawn(
             "figure_09_slip",
@@ -83,12 +91,14 @@ def depletion_figures(vehicle: VehicleParams) -> list[Drawn]:
             f"{sensitivity.FIG_9_SPEED_MPS:g} m/s, demand {sensitivity.FIG_9_DEMAND_W / 1000:g} kW at the wheels, rear "
             "slip 0.01.",
             figures.depletion_over_split(sensitivity.figure_9(vehicle)),
+            SENSITIVITY,
         ),
         Drawn(
             "figure_10_demand",
             "Figure 10: depletion over the split, by demand",
             f"{sensitivity.FIG_10_SPEED_MPS:g} m/s, both slips 0.01.",
             figures.depletion_over_split_panels(sensitivity.figure_10(vehicle)),
+            SENSITIVITY,
         ),
     ]
 
@@ -102,12 +112,14 @@ def solver_figures(convergence: tuple[FloatArray, FloatArray], chain: tuple[Floa
             "The paper's problem, friction 0.9: change of the policy in each iteration, and the Bellman residual, "
             "which bounds the distance from the optimal cost-to-go.",
             figures.policy_convergence(*convergence),
+            PROGRAM,
         ),
         Drawn(
             "transition_matrix",
             "Demand as a Markov chain",
             "Transition matrix of the paper's problem, a step of 0.1 s, from FTP-75, HWFET and NYCC.",
             figures.transition_matrix(*chain),
+            PROGRAM,
         ),
     ]
 
@@ -121,6 +133,7 @@ def rule_figure(rule: Rule) -> Drawn:
         "Figure 13: the generalized rule",
         "Dynamic programming on FTP-75, friction 0.9, and the line fitted to it.",
         figures.fitted_rule(demand, rule.front_share * demand, line_w, _rule_power(rule.coefficients, line_w)),
+        TABLES,
     )
 
 
@@ -142,12 +155,14 @@ def window_figures(window: dict[str, dict[str, FloatArray]]) -> list[Drawn]:
             "Figure 14: powers of the axles",
             "Friction 0.2, idle drive none.",
             figures.axle_powers(time_s, powers, span),
+            TABLE_6,
         ),
         Drawn(
             "figure_15_slips",
             "Figure 15: slips with and without skid avoidance",
             "Friction 0.2, idle drive none: the paper's SDP without skid avoidance, and ours.",
             figures.slips(time_s, slips, CRITICAL_SLIP, span),
+            TABLE_6,
         ),
     ]
 
@@ -166,6 +181,7 @@ def frontier_figure(frontier: Frontier) -> Drawn:
         f"{frontier.cycle}, friction {frontier.friction:g}, idle drive none: saving over changes of the share by more "
         "than 0.25, along the price of a change.",
         figures.switching_frontier(families),
+        FRONTIER,
     )
 
 
@@ -173,3 +189,23 @@ def _rule_power(rule: Sequence[float], demand_w: FloatArray) -> FloatArray:
     """Front power of the rule, as the law applies it (the share stays within 0..1)."""
     line = np.where(demand_w > 0.0, rule[0] + rule[1] * demand_w, rule[2] + rule[3] * demand_w)
     return np.clip(line, np.minimum(demand_w, 0.0), np.maximum(demand_w, 0.0))
+
+
+def convergence_of(policy: Policy) -> tuple[FloatArray, FloatArray]:
+    """Change of the policy, and the Bellman residual (half its span), in each iteration."""
+    change = np.array([iteration.policy_change for iteration in policy.iterations])
+    bound = np.array([iteration.bound_j for iteration in policy.iterations])
+    discount = policy.problem.discount
+    return change, bound * (1.0 - discount) / discount
+
+
+def window_of(results: Sequence[Result]) -> dict[str, dict[str, FloatArray]]:
+    """Series of the watched runs, by label, inside the window (or all of it, where the cycle is shorter)."""
+    made = {}
+    for result in results:
+        if result.series:
+            time_s = result.series["time_s"]
+            inside = (time_s >= WINDOW_S[0]) & (time_s <= WINDOW_S[1])
+            keep = inside if inside.any() else np.ones(time_s.size, dtype=bool)
+            made[result.case.name] = {name: values[keep] for name, values in result.series.items()}
+    return made

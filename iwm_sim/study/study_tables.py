@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from iwm_sim.study import battery_fit, paper
+from iwm_sim.study import ablation, battery_fit, paper
 from iwm_sim.study.content import FrontierPoint, PolicyIdentity, Robustness, Study
 from iwm_sim.study.criteria import Criterion
 from iwm_sim.study.labels import (
@@ -33,26 +33,41 @@ IDLE_DRIVES = {
 }
 
 
+#: Sections, each a heading above its tables and figures.
+TABLES, TABLE_6, PROGRAM = (
+    "Tables 3 to 5, beside the paper's",
+    "Table 6, as it should have been",
+    "Why the paper's program loses here",
+)
+FRONTIER, BATTERY, SENSITIVITY = (
+    "What a change of the share is worth",
+    "Battery (eq. 25)",
+    "Sensitivity (Fig. 8 to 10)",
+)
+
+
 class TableOf(NamedTuple):
-    """A table with its place: `section` is a heading above the first table of that name."""
+    """A table with its place: the section it stands in, and the command that makes it alone."""
 
     section: str
     title: str
     columns: Sequence[Column[Any]]
     rows: Sequence[Any]
     note: str = ""
+    command: str = ""
 
 
 def tables(study: Study) -> list[TableOf]:
     """All tables of a study."""
     return [
-        criteria_table(study),
-        *paper_tables(study),
+        *paper_tables(study.cells, in_order(study)),
         cell_by_cell(study),
-        *table_6(study),
+        ablation_table(study),
+        *table_6([*study.gates, *study.cells]),
         *rivals(study),
-        stops_table(study),
         frontier_table(study),
+        criteria_table(study),
+        stops_table(study),
         *robustness_tables(study),
         battery_table(study),
         sensitivity_table(study),
@@ -127,12 +142,22 @@ def _printed(name: str) -> Callable[[Cell], float | None]:
     return value
 
 
-def paper_tables(study: Study) -> Iterator[TableOf]:
+def _as_printed(name: str) -> Callable[[Cell], str | None]:
+    """The paper's number with all of its digits: one of them has three."""
+
+    def value(by: Cell) -> str | None:
+        number = _printed(name)(by)
+        return None if number is None else max(f"{number:.2f}", f"{number:g}", key=len)
+
+    return value
+
+
+def paper_tables(rows: Sequence[Row], cycles: Sequence[str]) -> Iterator[TableOf]:
     """Tables 3 to 5 beside the paper's."""
-    by_cell = by_place(study.cells)
+    by_cell = by_place(rows)
     columns: tuple[Column[Cell], ...] = (
         _CYCLE,
-        *(Column(name, _printed(name), "%", 2, group="printed ΔSoC") for name in ("ED", "GRDP", "SDP")),
+        *(Column(name, _as_printed(name), "%", 2, group="printed ΔSoC") for name in ("ED", "GRDP", "SDP")),
         Column("saving", _printed("saving"), "%", 2, group="printed"),
         *(Column(label, _delta_soc(label), "%", 3, group="ΔSoC here") for label in (ED, GRDP, PAPER_SDP, OURS)),
         *(Column(label, _saving(label), "%", 2, group="saving here") for label in (GRDP, PAPER_SDP, OURS)),
@@ -141,14 +166,15 @@ def paper_tables(study: Study) -> Iterator[TableOf]:
     )
     for friction in paper.FRICTIONS:
         for idle_drive, meaning in IDLE_DRIVES.items():
-            places = [Place(cycle, friction, idle_drive) for cycle in in_order(study)]
+            places = [Place(cycle, friction, idle_drive) for cycle in cycles]
             yield TableOf(
-                "Tables 3 to 5, beside the paper's",
+                TABLES,
                 f"Table {paper.TABLES[friction]}: friction {friction:g}, {meaning}",
                 columns,
                 [by_cell[place] for place in places if place in by_cell],
                 "Left as printed, right as driven here. Savings are against ED of the same table. Possible: preview of "
                 "the whole cycle, with changes of the split at our policy's price.",
+                f"evaluate --paper {paper.TABLES[friction]}",
             )
 
 
@@ -216,9 +242,9 @@ def verdict(printed_percent: float | None, none: Cell, drag: Cell) -> str:
     return f"{first}; the paper's problem saves nothing here"
 
 
-def table_6(study: Study) -> Iterator[TableOf]:
+def table_6(rows: Sequence[Row]) -> Iterator[TableOf]:
     """Skid avoidance: without, as printed, and ours."""
-    by_cell = by_place([*study.gates, *study.cells])
+    by_cell = by_place(rows)
     labels = {GATE_OFF: "without", GATE_TABLE_2: "with Table 2", OURS: "ours"}
     columns: list[Column[Cell]] = [_CYCLE, _FRICTION]
     for name, text, unit, decimals in (
@@ -232,32 +258,62 @@ def table_6(study: Study) -> Iterator[TableOf]:
     columns.append(_trace(labels))
     for idle_drive, meaning in IDLE_DRIVES.items():
         yield TableOf(
-            "Table 6, as it should have been",
+            TABLE_6,
             meaning,
             columns,
             _sorted(by for place, by in by_cell.items() if place.idle_drive == idle_drive),
             "Without and with: the paper's SDP, its gate off, and on/off as Table 2 prints it. Ours holds the wheel "
             "short of the critical slip and has Table 2 as the last resort. Locked: an axle beyond a slip of -0.2 "
             "above 1 m/s, in all and at a stretch.",
+            "evaluate --paper 6",
         )
 
 
 # --- beyond the paper -----------------------------------------------------------------------------------------------
 
 
+def ablation_table(study: Study) -> TableOf:
+    """What each choice of the paper's program costs."""
+    return TableOf(
+        PROGRAM,
+        "",
+        ablation.columns(study.ablation),
+        study.ablation,
+        "Saving against equal split, idle drive none: the paper's program with one of its choices changed, with "
+        "some and with all of these, and ours. Each is solved anew.",
+        "evaluate --ablation",
+    )
+
+
+#: The bounds, and what their changes cost.
+_BOUNDS = {BOUND: "priced", FREE_BOUND: "free"}
+
+
+def _percent(part: float | None) -> float | None:
+    return None if part is None else 100.0 * part
+
+
 def rivals(study: Study) -> Iterator[TableOf]:
     """Every strategy's saving, and how often it changes the split."""
     by_cell = by_place(study.cells)
     labels = [label for label in next(iter(by_cell.values())) if label != ED]
+    slip_aware = [label for label in labels if label.startswith(INSTANTANEOUS_SLIP)]
+    prices = {label: label.removeprefix(INSTANTANEOUS_SLIP).strip() for label in slip_aware}
     columns: list[Column[Cell]] = [
         _CYCLE,
         _FRICTION,
-        *(Column(label, _saving(label), "%", 2) for label in labels),
-        Column("ours of possible", lambda by: by[OURS].share_of_possible, decimals=2),
+        *(
+            Column(label, _saving(label), "%", 2, group="saving")
+            for label in labels
+            if label not in (*prices, *_BOUNDS)
+        ),
+        *(Column(price, _saving(label), "%", 2, group=INSTANTANEOUS_SLIP) for label, price in prices.items()),
+        *(Column(text, _saving(label), "%", 2, group="preview") for label, text in _BOUNDS.items() if label in labels),
+        Column("ours of possible", lambda by: _percent(by[OURS].share_of_possible), "%", 0),
         Column("ours", _changes(OURS), "1/min", 1, group="changes"),
-        *(Column(x, _changes(x), "1/min", 1, group="changes") for x in labels if x.startswith(INSTANTANEOUS_SLIP)),
+        *(Column(price, _changes(label), "1/min", 1, group="changes") for label, price in prices.items()),
         Column("ours", _metric(OURS, "share_travel_per_min"), "1/min", 1, group="moved"),
-        Column(INSTANTANEOUS, _metric(INSTANTANEOUS, "share_travel_per_min"), "1/min", 1, group="moved"),
+        Column("blind", _metric(INSTANTANEOUS, "share_travel_per_min"), "1/min", 1, group="moved"),
         _trace(),
     ]
     for idle_drive, meaning in IDLE_DRIVES.items():
@@ -267,8 +323,9 @@ def rivals(study: Study) -> Iterator[TableOf]:
             columns,
             _sorted(by for place, by in by_cell.items() if place.idle_drive == idle_drive),
             "Saving of battery energy against equal split on the same road; no number where the distances differ by "
-            "more than 0.1 %. Preview knows the whole cycle; its changes of the share have the price they have in our "
-            "policy, or none. Changes are those by more than 0.25; moved is the sum of all, 1 being all the power.",
+            "more than 0.1 %. instantaneous_slip changes the share only to save the power shown. Preview knows the "
+            "whole cycle; its changes have the price they have in our policy, or none. Changes are those by more than 0.25; "
+            "moved is the sum of all, 1 being all the power; blind is instantaneous.",
         )
 
 
@@ -305,7 +362,7 @@ def frontier_table(study: Study) -> TableOf:
         Column("Changes of the share", lambda row: row.share_changes_per_min, "1/min", 1),
     )
     return TableOf(
-        "What a change of the share is worth",
+        FRONTIER,
         f"{frontier.cycle}, friction {frontier.friction:g}, idle drive none",
         columns,
         [point for point in frontier.points if point.family != ED],
@@ -348,12 +405,13 @@ def battery_table(study: Study) -> TableOf:
     )
     over = " and ".join(study.battery_fit["file"].rmse_by_cycle)
     return TableOf(
-        "Battery (eq. 25)",
+        BATTERY,
         "",
         columns,
         list(study.battery_fit.items()),
         f"The paper's estimate is {battery_fit.PAPER_RESISTANCE_OHM} Ω. RMSE with the 1/N that eq. 25 lacks, over "
         f"{over}.",
+        "evaluate --fit-battery",
     )
 
 
@@ -376,7 +434,7 @@ def sensitivity_table(study: Study) -> TableOf:
         Column("Front share of least depletion", lambda row: row.share, "", 2),
     )
     note = "At shares 0 and 1 of equal slips the depletion is the same."
-    return TableOf("Sensitivity (Fig. 8 to 10)", "", columns, rows, note)
+    return TableOf(SENSITIVITY, "", columns, rows, note)
 
 
 def implied_table(study: Study) -> TableOf:

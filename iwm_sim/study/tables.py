@@ -16,13 +16,27 @@ def _saving(row: Row) -> float | str | None:
     return "distance" if row.same_distance_as_equal is False else row.saving_percent
 
 
+def _possible(row: Row) -> float | None:
+    """Part of the possible saving, %; nothing where the strategy saves nothing."""
+    return 100.0 * row.share_of_possible if row.share_of_possible and row.share_of_possible > 0.0 else None
+
+
+def _policy(row: Row) -> str:
+    made = row.made_with
+    return f"{made['policy_grid']} {made['policy_checksum'][:8]}" if made.get("policy_checksum") else ""
+
+
+def _period(row: Row) -> float | None:
+    return row.made_with["settings"]["decision_period_s"] if row.made_with else None
+
+
 #: Columns of the results of `evaluate`.
 COLUMNS: tuple[Column[Row], ...] = (
     Column("strategy", lambda row: row.label),
     Column("Wh/km", lambda row: row.metrics.wh_per_km, decimals=2),
     Column("ΔSoC %", lambda row: row.metrics.delta_soc_percent, decimals=3),
     Column("saving %", _saving, decimals=2),
-    Column("of possible", lambda row: row.share_of_possible, decimals=2),
+    Column("% of possible", _possible, decimals=0),
     Column("changes/min", lambda row: row.metrics.share_changes_per_min, decimals=1),
     Column("rms error m/s", lambda row: row.metrics.rms_speed_error_mps, decimals=3),
     Column("max error m/s", lambda row: row.metrics.max_speed_error_mps, decimals=2),
@@ -30,13 +44,15 @@ COLUMNS: tuple[Column[Row], ...] = (
     Column("max slip", lambda row: row.metrics.max_slip, decimals=3),
     Column("locked s", lambda row: row.metrics.locked_s, decimals=2),
     Column("trace", _trace),
+    Column("decides every s", _period, decimals=2),
+    Column("policy", _policy),
 )
 
 
 def text_table(rows: Sequence[Row], columns: Sequence[Column[Row]] = COLUMNS) -> str:
     """A plain-text table, with a heading where idle drive, cycle or friction change."""
-    head = [column.label for column in columns]
     cells = [[column.shown(row) for column in columns] for row in rows]
+    head = [column.label for column in columns]
     widths = [max(len(line[i]) for line in [head, *cells]) for i in range(len(columns))]
     lines = []
     before = None
@@ -44,9 +60,18 @@ def text_table(rows: Sequence[Row], columns: Sequence[Column[Row]] = COLUMNS) ->
         if row.place != before:
             before = row.place
             title = f"{before.cycle}, friction {before.friction:g}, idle drive {before.idle_drive}"
-            lines += ["", title, _aligned(head, widths, columns)]
+            rate = f", control at {1.0 / row.made_with['dt_s']:g} Hz" if row.made_with else ""
+            lines += ["", title + rate, _aligned(head, widths, columns)]
         lines.append(_aligned(line, widths, columns))
     return "\n".join(lines[1:])
+
+
+def plain_table[R](rows: Sequence[R], columns: Sequence[Column[R]]) -> str:
+    """A plain-text table under up to three lines of heading: group, label, unit."""
+    heads = [[column.group for column in columns], [column.label for column in columns], [c.unit for c in columns]]
+    lines = [line for line in heads if any(line)] + [[column.shown(row) for column in columns] for row in rows]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    return "\n".join(_aligned(line, widths, columns) for line in lines)
 
 
 def _aligned[R](cells: Sequence[str], widths: Sequence[int], columns: Sequence[Column[R]]) -> str:

@@ -22,9 +22,7 @@ def built():
         "fig14": f.axle_powers(TIME, [f.SplitRun("sdp", 1e3 * WAVE, 2e3 * WAVE)], (20.0, 40.0)),
         "fig15": f.slips(TIME, [f.SlipRun("with", WAVE, WAVE), f.SlipRun("without", WAVE, WAVE)], 0.2),
         "transitions": f.transition_matrix(np.array([[0.9, 0.1], [0.0, 1.0]]), [0.0, 1e3]),
-        "bars": f.bars_by_cycle(
-            ["NYCC"], {"sdp": [1.0], "rule": [float("nan")]}, "Saving, %", {"sdp": [True], "rule": [False]}
-        ),
+        "frontier": f.switching_frontier({"ours": ([4.0, 6.0], [2.3, 2.45]), "preview": ([0.0, 7.0], [0.0, 2.47])}),
     }
 
 
@@ -89,6 +87,8 @@ def test_demand_classes_stand_in_the_middle_of_their_cells(figures):
     np.testing.assert_allclose(edges, [-0.5, 0.5, 1.5])
 
 
-def test_a_run_that_may_not_be_compared_is_hatched(figures):
-    hatches = [bar.get_hatch() for bar in figures["bars"].axes[0].patches]
-    assert hatches == [None, "////"]
+def test_the_frontier_is_zoomed_to_what_matters_and_shows_all_below(figures):
+    near, all_of_it = figures["frontier"].axes
+    assert near.get_ylim()[0] == pytest.approx(2.22)
+    assert near.get_xlim()[0] > 3.0
+    assert all_of_it.get_ylim()[0] < 0.0

@@ -7,10 +7,10 @@ import pytest
 
 from iwm_power_manager.errors import ConfigError
 from iwm_sim.metrics import Metrics
-from iwm_sim.study import battery_fit, criteria, labels, pages, paper, study_tables
+from iwm_sim.study import answers, battery_fit, criteria, labels, pages, paper, study_tables
 from iwm_sim.study.cases import Rule, vehicle_of
 from iwm_sim.study.content import Study
-from iwm_sim.study.report import render
+from iwm_sim.study.report import anchor, render
 from iwm_sim.study.rows import Place, Row, by_place
 from iwm_sim.study.study_figures import Material, drawn
 
@@ -69,7 +69,7 @@ def test_a_study_survives_its_file(content):
 
 
 def test_every_cell_of_the_paper_stands_beside_ours(content):
-    made = list(study_tables.paper_tables(content))
+    made = list(study_tables.paper_tables(content.cells, study_tables.in_order(content)))
     assert len(made) == 6
     for table in made:
         assert [table.columns[0].value(row) for row in table.rows] == list(paper.CYCLES)
@@ -109,9 +109,30 @@ def test_page_markdown_and_pictures_are_written(content, material, tmp_path):
         assert any(name.startswith(f"figure_{number}_") for name in files)
     page = (tmp_path / "study.html").read_text()
     assert all(picture.title in page for picture in pictures)
+    assert page.index(answers.answers(content)[0].question) < page.index("<table")
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert (tmp_path / "study.md").read_text().startswith(f"# {pages.TITLE}")
 
 
 def test_the_page_needs_nothing_but_the_numbers(content):
-    assert "criteria" in render(pages.page(content, []))
+    page = render(pages.page(content, []))
+    assert "criteria" in page
+    for section, _ in pages.sections(content):
+        assert f'<a href="#{anchor(section)}">' in page
+        assert f'<h2 id="{anchor(section)}">' in page
+
+
+def test_answers_follow_from_the_numbers(content):
+    holds, program, better, nothing = (made.answer for made in answers.answers(content))
+    best = max(answers.savings(content, labels.OURS, "none").values())
+    assert f"to {best:.2f} %" in better
+    assert "hwfet at friction 0.9" in nothing
+    assert "in 0 of 24 cells" in program
+    assert f"{content.paper.mean_saving_percent:.2f} %" in holds
+
+
+def test_the_papers_number_with_three_digits_keeps_them(content):
+    first = next(study_tables.paper_tables(content.cells, study_tables.in_order(content)))
+    (nycc,) = (row for row in first.rows if first.columns[0].value(row) == "nycc")
+    assert first.columns[1].shown(nycc) == "1.585"
+    assert first.columns[2].shown(nycc) == "1.58"

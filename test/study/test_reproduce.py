@@ -5,7 +5,7 @@ import shutil
 import pytest
 
 from iwm_power_manager.errors import ConfigError
-from iwm_sim.study import cases, policies, reproduce
+from iwm_sim.study import cases, paper, plan, policies, reproduce
 from iwm_sim.study.content import Study, rounded
 
 
@@ -24,11 +24,10 @@ def test_numbers_keep_six_digits_and_nan_becomes_null():
 @pytest.mark.timeout(1800)
 def test_the_whole_study_runs_on_a_short_cycle(hill, tmp_path, small_grid, monkeypatch):
     monkeypatch.setattr(cases, "RULE_CYCLE", str(hill))
-    monkeypatch.setattr(reproduce, "PAPER_GRID_WITHOUT", reproduce.PAPER_GRID)
     bank = tmp_path / "bank"
     bank.mkdir()
-    for idle_drive in reproduce.IDLE_DRIVES:
-        for friction in reproduce.paper.FRICTIONS:
+    for idle_drive in plan.IDLE_DRIVES:
+        for friction in paper.FRICTIONS:
             car = cases.vehicle_of("jalalmaab_2015", idle_drive)
             made = policies.solved(car, friction, str(small_grid), cycles=(str(hill),))
             shutil.copy(made, bank / f"{idle_drive}_{friction}.npz")

@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from iwm_power_manager.policy import load_policy
+from iwm_sim.study import variants
+from iwm_sim.study.content import Study
 from iwm_sim.tools import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -76,6 +79,81 @@ def test_series_are_saved_with_an_array_for_each_signal(hill, tmp_path):
     with np.load(folder / "hill_drag_mu090_equal.npz") as series:
         assert series["speed_mps"].max() == pytest.approx(10.0, abs=0.2)
         assert len(series["time_s"]) == len(series["soc"])
+
+
+def test_the_default_is_our_strategy_beside_equal_split_and_several_values_are_given_either_way(
+    hill, small_policy, tmp_path
+):
+    out = tmp_path / "out.json"
+    arguments = ["--cycle", str(hill), "--friction", "0.9", "--friction", "0.5", "--idle-drive", "none", "--quiet"]
+    assert evaluate.main([*arguments, "--policy", str(small_policy), "--json", str(out)]) == 0
+    seen = [(row["friction"], row["strategy"]) for row in rows_of(out)]
+    assert seen == [(mu, name) for mu in (0.9, 0.5) for name in ("equal", "sdp_lookahead")]
+
+
+def test_every_result_says_what_it_was_made_with(hill, small_policy, tmp_path, capsys):
+    arguments = ["--cycle", str(hill), "--idle-drive", "none", "--policy", str(small_policy), "--jobs", "1"]
+    assert evaluate.main([*arguments, "--strategy", "sdp", "preview", "--decision-period", "0.1", "--dt", "0.02"]) == 0
+    shown = capsys.readouterr().out
+    assert "friction 0.9, idle drive none, control at 50 Hz" in shown
+    assert f"small {load_policy(small_policy).checksum[:8]}" in shown
+    assert "preview, 0 J a move + 20 J for any change" in shown
+    assert shown.count("0.10") >= 3  # equal, sdp and preview decide every 0.1 s
+
+
+def test_the_papers_strategy_has_a_name_a_grid_and_a_period_of_its_own(hill, small_grid, tmp_path, monkeypatch):
+    monkeypatch.setitem(variants.VARIANTS, "paper_sdp", variants.VARIANTS["paper_sdp"]._replace(grid=str(small_grid)))
+    out = tmp_path / "out.json"
+    assert evaluate.main(["--cycle", str(hill), "--strategy", "paper_sdp", "--json", str(out), "--quiet"]) == 0
+    row = rows_of(out)[1]
+    assert (row["label"], row["strategy"], row["policy_grid"]) == ("paper_sdp", "sdp", "small")
+    assert row["settings"]["decision_period_s"] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--strategy", "equal", "--policy", "policies"], "--policy: has no effect"),
+        (["--strategy", "paper_sdp", "--grid", "fine"], "--grid: has no effect"),
+        (["--strategy", "paper_sdp", "--decision-period", "0.02"], "decide every 0.1 s"),
+        (["--switching-power", "5"], "--switching-power: has no effect"),
+        (["--switching-cost", "5"], "--switching-cost: has no effect"),
+        (["--seed", "3"], "there is no --noise"),
+        (["--gate-mode", "off", "--no-gate-driving"], "gates nothing"),
+        (["--plot", "a.svg"], "--plot: has no effect"),
+        (["--study", "out"], "--cycle: has no effect with --study"),
+        (["--fit-battery", "--dt", "0.02"], "--dt: has no effect with --fit-battery"),
+    ],
+)
+def test_an_option_without_effect_is_refused(arguments, words, capsys):
+    assert evaluate.main(["--cycle", "nycc", *arguments]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_grid_that_is_asked_for_is_used_or_refused(hill, small_policy, small_grid, capsys):
+    arguments = ["--cycle", str(hill), "--idle-drive", "none", "--strategy", "sdp", "--policy", str(small_policy)]
+    assert evaluate.main([*arguments, "--grid", str(small_grid), "--quiet"]) == 0
+    assert evaluate.main([*arguments, "--grid", "fine"]) == 2
+    assert "was solved on grid small, not on fine" in capsys.readouterr().err
+
+
+def test_a_figure_is_drawn_alone(tmp_path, capsys):
+    assert evaluate.main(["--figure", "9", "--plot", str(tmp_path / "nine.svg")]) == 0
+    assert "Figure 9" in capsys.readouterr().out
+    assert (tmp_path / "nine.svg").read_text().lstrip().startswith("<?xml")
+    assert evaluate.main(["--figure", "9"]) == 2
+    assert "--plot: is missing" in capsys.readouterr().err
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("table", ["3", "6"])
+def test_a_cell_of_the_papers_tables_is_that_of_the_study(table, capsys):
+    assert evaluate.main(["--paper", table, "--cycle", "nycc", "--idle-drive", "none"]) == 0
+    shown = capsys.readouterr().out
+    stored = Study.load(ROOT / "docs" / "study.json")
+    (ours,) = (row for row in stored.cells if row.place == ("nycc", 0.9, "none") and row.label == "ours")
+    assert f"{ours.metrics.delta_soc_percent:.3f}" in shown
+    assert "paper_sdp" in shown and "coupled" in shown
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@
       const now = panel.series.map((series) => {
         const key = node(head, "span", { class: "key" });
         const swatch = node(key, "svg", { viewBox: "0 0 22 10", "aria-hidden": "true" });
-        node(swatch, "line", { x1: 1, x2: 21, y1: 5, y2: 5, style: `stroke:var(--c${series.colour});stroke-width:${series.wide ? 4 : 2}`, "stroke-dasharray": series.dashed ? "5 3" : "none" });
+        node(swatch, "line", { x1: 1, x2: 21, y1: 5, y2: 5, style: `stroke:var(--c${series.colour});stroke-width:${series.wide ? 6 : 2};opacity:${series.wide ? 0.45 : 1}`, "stroke-dasharray": series.dashed ? "5 3" : "none" });
         node(key, "span", {}, series.name);
         return node(key, "span", { class: "now" });
       });
@@ -138,7 +138,7 @@
         });
         const lines = node(plot, "g", { "clip-path": `url(#${clip})` });
         for (const series of panel.series) {
-          node(lines, "path", { class: "series", d: path(time, series.values, from, to, x, y, series.step), style: `stroke:var(--c${series.colour});stroke-width:${series.wide ? 2.8 : 1.4}`, "stroke-dasharray": series.dashed ? "5 3" : "none" });
+          node(lines, "path", { class: series.wide ? "series wide" : "series", d: path(time, series.values, from, to, x, y, series.step), style: `stroke:var(--c${series.colour});stroke-width:${series.wide ? 6 : 1.4}`, "stroke-dasharray": series.dashed ? "5 3" : "none" });
         }
         for (const [value, label] of panel.references) {
           if (value < low || value > high) continue;

@@ -1,0 +1,153 @@
+"""Why the paper's program loses: what each of its choices costs, changed alone and all together.
+
+The base is `paper_sdp`. Each change takes one thing from grid `coupled` or `fine`, or from how the policy is used; the
+problem is solved anew and driven. The single changes were named before any of them was driven, and which two belong
+together after.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from iwm_power_manager.files import atomic_write
+from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
+from iwm_power_manager.solve import load_grid
+from iwm_sim.study import cases, labels
+from iwm_sim.study.cases import Case
+from iwm_sim.study.driving import drive_all
+from iwm_sim.study.plan import STRATEGY, Policies, variant
+from iwm_sim.study.policies import solved
+from iwm_sim.study.report import Column
+from iwm_sim.study.rows import Place, by_place, rows_of
+from iwm_sim.study.variants import VARIANTS
+
+
+class Step(NamedTuple):
+    """A change of the paper's program.
+
+    Attributes
+    ----------
+    meaning : what becomes of what
+    taken : names of settings, from which grid
+    strategy : "" leaves interpolation in the table
+    """
+
+    meaning: str
+    taken: tuple[tuple[str, str], ...] = ()
+    strategy: str = ""
+
+
+STEPS = {
+    "speed grid": Step("4 speeds become 26", (("speed_mps", "coupled"),)),
+    "slip grid": Step("11 slips an axle become 19", (("slip_front", "fine"), ("slip_rear", "fine"))),
+    "error at the road": Step("power error at the wheel becomes that at the road", (("power_error", "coupled"),)),
+    "size of the error": Step("the squared power error becomes its size", (("error_norm", "coupled"),)),
+    "alpha": Step("the weight of the power error, 2, becomes 20", (("alpha", "coupled"),)),
+    "gamma": Step("discount 0.98 becomes 0.99", (("discount", "fine"),)),
+    "look-ahead": Step("one step ahead on the cost-to-go instead of interpolating shares", (), "sdp_lookahead"),
+}
+#: Steps taken together: the two that help most alone, the grids with them, and all.
+TOGETHER = {
+    "speed grid, look-ahead": ("speed grid", "look-ahead"),
+    "speed and slip grid, look-ahead": ("speed grid", "slip grid", "look-ahead"),
+    "all of these": tuple(STEPS),
+}
+
+#: Where the variants are driven, idle drive none (that of the paper's eq. 23).
+PLACES = (("nycc", 0.9), ("udds", 0.9), ("nycc", 0.2), ("udds", 0.2))
+
+
+@dataclass(frozen=True)
+class Ablated:
+    """A program and what it saves against equal split, %, by place; None where the distances differ."""
+
+    program: str
+    meaning: str
+    saving_percent: dict[str, float | None]
+
+
+def ablation(
+    policies: Policies,
+    folder: Path,
+    jobs: int,
+    say: Callable[[str], None],
+    places: Sequence[tuple[str, float]] = PLACES,
+) -> list[Ablated]:
+    """Solve and drive every variant; grids go to a folder, policies are kept in the user's cache.
+
+    Parameters
+    ----------
+    policies : of the car
+    folder : for the grids
+    jobs : processes
+    say : told of everything that is solved
+    places : cycles with frictions
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted: list[Case] = []
+    for cycle, friction in places:
+        base = Case(cycle, policies.vehicle, "none", friction, "equal")
+        wanted += [
+            replace(base, label=labels.ED),
+            variant(base, labels.PAPER_SDP, policies),
+            *(_changed(base, name, [name], policies, folder, say) for name in STEPS),
+            *(_changed(base, name, steps, policies, folder, say) for name, steps in TOGETHER.items()),
+            replace(base, strategy=STRATEGY, label=labels.OURS, policy=policies.ours("none", friction)),
+        ]
+    by = by_place(rows_of(drive_all(wanted, jobs)))
+    meanings = {
+        labels.PAPER_SDP: VARIANTS[labels.PAPER_SDP].meaning,
+        **{name: step.meaning for name, step in STEPS.items()},
+        **dict.fromkeys(TOGETHER, "together"),
+        labels.OURS: "slip settled in the step, previous share a state, moves priced, demand by speed, of a driver, "
+        "decided every 0.02 s",
+    }
+    return [
+        Ablated(
+            program,
+            meaning,
+            {
+                f"{cycle} {friction:g}": by[Place(cases.cycle_of(cycle).name, friction, "none")][program].saving_percent
+                for cycle, friction in places
+            },
+        )
+        for program, meaning in meanings.items()
+    ]
+
+
+def _changed(
+    base: Case, label: str, names: Sequence[str], policies: Policies, folder: Path, say: Callable[[str], None]
+) -> Case:
+    """The paper's strategy with some steps taken, solved on a grid of its own."""
+    paper_grid = VARIANTS[labels.PAPER_SDP].grid
+    settings: dict[str, Any] = load_grid(paper_grid).settings()
+    for name in names:
+        for setting, grid in STEPS[name].taken:
+            settings[setting] = load_grid(grid).settings()[setting]
+    del settings["name"]
+    file = folder / f"{'_'.join(label.replace('-', ' ').split())}.yaml"  # JSON is YAML
+    atomic_write(file, json.dumps(settings | {"format": PROBLEM_FORMAT}).encode())
+    strategy = next((STEPS[name].strategy for name in names if STEPS[name].strategy), "")
+    case = VARIANTS[labels.PAPER_SDP].case(base, label)
+    if not strategy or len(names) > 1:
+        policy = solved(policies.car(base.idle_drive), base.friction, str(file), say)
+    else:
+        policy = policies.of_variant(labels.PAPER_SDP, base.idle_drive, base.friction)
+    return replace(case, strategy=strategy or case.strategy, policy=policy)
+
+
+def columns(rows: Sequence[Ablated]) -> list[Column[Ablated]]:
+    """The table's columns: a saving for each place."""
+
+    def saving(place: str) -> Callable[[Ablated], float | None]:
+        return lambda row: row.saving_percent[place]
+
+    return [
+        Column("program", lambda row: row.program),
+        *(Column(place, saving(place), "%", 2, group="saving") for place in rows[0].saving_percent),
+        Column("what it is", lambda row: row.meaning),
+    ]

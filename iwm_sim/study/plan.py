@@ -1,0 +1,240 @@
+"""What a study drives: the cells of the paper's tables, the rivals, the frontier, the robustness and the stops."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from iwm_power_manager.control.settings import GATE_MODES
+from iwm_power_manager.files import atomic_write
+from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
+from iwm_power_manager.vehicle import Vehicle
+from iwm_sim.study import cases, labels, paper, skid
+from iwm_sim.study.cases import Case, Change, Rule, SensorNoise
+from iwm_sim.study.driving import on_all_cores
+from iwm_sim.study.policies import PolicySource, solved
+from iwm_sim.study.variants import VARIANTS
+
+IDLE_DRIVES = ("none", "drag")
+#: The strategy that plays our policy.
+STRATEGY = "sdp_lookahead"
+
+#: Power a change has to save, W, of the strongest rival in the tables.
+RIVAL_SWITCHING_W = (40.0, 60.0, 100.0)
+
+#: The switching frontier: cycle and road, and the prices along it.
+FRONTIER_CYCLE, FRONTIER_FRICTION = "udds", 0.9
+FRONTIER_POWERS_W = (0.0, 15.0, 30.0, 60.0, 100.0, 200.0, 400.0)
+FRONTIER_COSTS_J = (0.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
+FRONTIER_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+
+ROBUSTNESS_CYCLES = ("hwfet", "udds")
+
+#: Where Figures 14 and 15 look, and what they need.
+WINDOW_CYCLE, WINDOW_FRICTION = "udds", 0.2
+WINDOW_SIGNALS = ("time_s", "front_power_w", "rear_power_w", "front_slip", "rear_slip")
+
+#: Loss coefficients of a direct-drive hub motor, the second set of docs/model.md.
+HUB_MOTOR = (
+    Change("motor", "loss_constant_w", 40.0),
+    Change("motor", "loss_linear_speed", 1.57),
+    Change("motor", "loss_quadratic_speed", 0.0166),
+    Change("motor", "loss_linear_torque", 1.50),
+    Change("motor", "loss_quadratic_torque", 0.045),
+)
+
+#: A car's idle drive, and a road.
+Key = tuple[str, float]
+
+
+class Policies:
+    """The policies of a study, each found or solved when it is first asked for.
+
+    Parameters
+    ----------
+    vehicle, policy : car, and folder or file of our policies for it
+    say : told, in one line, of everything that is solved
+    """
+
+    def __init__(self, vehicle: str, policy: str, say: Callable[[str], None] = lambda _: None) -> None:
+        self.vehicle = vehicle
+        self._source = PolicySource(policy, say=say)
+        self._say = say
+        self.ours = functools.cache(self._ours)
+        self.of_variant = functools.cache(self._of_variant)
+
+    def car(self, idle_drive: str) -> Vehicle:
+        """The car with an idle drive."""
+        return cases.vehicle_of(self.vehicle, idle_drive)
+
+    def _ours(self, idle_drive: str, friction: float) -> str:
+        return self._source.find(self.car(idle_drive), friction)
+
+    def _of_variant(self, name: str, idle_drive: str, friction: float) -> str:
+        return solved(self.car(idle_drive), friction, VARIANTS[name].grid, self._say)
+
+    def priced(self, folder: Path) -> dict[float, str]:
+        """Our policy solved for other prices of a change, by price in J; the problems go to a folder."""
+        at_hand = self.ours(IDLE_DRIVES[0], FRONTIER_FRICTION)
+        problem = cases.policy_of(at_hand).problem
+        made = {}
+        for factor in FRONTIER_FACTORS:
+            price = factor * max(problem.switching_fixed_cost_j, problem.switching_cost_j)
+            settings = problem.settings() | {
+                "format": PROBLEM_FORMAT,
+                "switching_cost_j": factor * problem.switching_cost_j,
+                "switching_fixed_cost_j": factor * problem.switching_fixed_cost_j,
+            }
+            del settings["name"]
+            grid = folder / f"price_{price:g}_j.yaml"  # JSON is YAML
+            atomic_write(grid, json.dumps(settings).encode())
+            other = factor != 1.0
+            made[price] = (
+                solved(self.car(IDLE_DRIVES[0]), FRONTIER_FRICTION, str(grid), self._say) if other else at_hand
+            )
+        return made
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Cases by the part of the study they are for."""
+
+    cells: list[Case] = field(default_factory=list)
+    gates: list[Case] = field(default_factory=list)
+    frontier: list[Case] = field(default_factory=list)
+    robustness: list[tuple[str, Case]] = field(default_factory=list)
+
+    @property
+    def cases(self) -> list[Case]:
+        """All of them, in this order."""
+        return [*self.cells, *self.gates, *self.frontier, *(case for _, case in self.robustness)]
+
+
+def keys() -> list[Key]:
+    """Every idle drive on every road."""
+    return [(idle_drive, friction) for idle_drive in IDLE_DRIVES for friction in paper.FRICTIONS]
+
+
+def fitted_rules(vehicle: str, wanted: Sequence[Key], jobs: int) -> dict[Key, Rule]:
+    """The paper's generalized rule for each idle drive and road."""
+    over = [Case(cases.RULE_CYCLE, vehicle, idle_drive, friction, "rule") for idle_drive, friction in wanted]
+    return dict(zip(wanted, on_all_cores(cases.fitted_rule, over, jobs), strict=True))
+
+
+def whole(policies: Policies, cycles: Sequence[str], rules: Mapping[Key, Rule], priced: Mapping[float, str]) -> Plan:
+    """All that a study drives, the longest cycles first."""
+    plan = Plan()
+    for cycle in sorted(cycles, key=lambda name: -cases.cycle_of(name).duration_s):
+        for key in keys():
+            watched = cycle == among(WINDOW_CYCLE, cycles) and key == (IDLE_DRIVES[0], WINDOW_FRICTION)
+            keep = WINDOW_SIGNALS if watched else ()
+            base = Case(cycle, policies.vehicle, *key, "equal")
+            plan.cells.extend(cell(base, policies, rules[key].coefficients, keep))
+            plan.gates.extend(gates(base, policies, keep))
+    base = Case(among(FRONTIER_CYCLE, cycles), policies.vehicle, IDLE_DRIVES[0], FRONTIER_FRICTION, "equal")
+    plan.frontier.extend(frontier(base, priced))
+    for idle_drive in IDLE_DRIVES:
+        for cycle in dict.fromkeys(among(name, cycles) for name in ROBUSTNESS_CYCLES):
+            plan.robustness.extend(robustness(Case(cycle, policies.vehicle, idle_drive, 0.9, "equal"), policies))
+    return plan
+
+
+def among(cycle: str, cycles: Sequence[str]) -> str:
+    """A cycle, or the first one if it is not driven."""
+    return cycle if cycle in cycles else cycles[0]
+
+
+def cell(base: Case, policies: Policies, rule: tuple[float, ...], keep: tuple[str, ...] = ()) -> list[Case]:
+    """All strategies in one cell of Tables 3 to 5, all under the law's normal settings."""
+    key = (base.idle_drive, base.friction)
+    policy = policies.ours(*key)
+    rivals = [
+        replace(
+            base,
+            strategy="instantaneous_slip",
+            label=f"{labels.INSTANTANEOUS_SLIP} {power:g} W",
+            settings=base.settings._replace(switching_power_w=power),
+        )
+        for power in RIVAL_SWITCHING_W
+    ]
+    return [
+        replace(base, label=labels.ED, keep=keep),
+        replace(base, strategy="rule", label=labels.GRDP, rule=rule),
+        variant(base, labels.PAPER_SDP, policies),
+        replace(base, strategy=STRATEGY, label=labels.OURS, policy=policy, keep=keep),
+        replace(base, strategy="instantaneous", label=labels.INSTANTANEOUS),
+        *rivals,
+        replace(cases.priced_as(base, policy), strategy="preview", label=labels.BOUND),
+        replace(base, strategy="preview", label=labels.FREE_BOUND),
+    ]
+
+
+def variant(base: Case, name: str, policies: Policies) -> Case:
+    """The paper's strategy by name."""
+    policy = policies.of_variant(name, base.idle_drive, base.friction)
+    return VARIANTS[name].case(base, name, policy)
+
+
+def gates(base: Case, policies: Policies, keep: tuple[str, ...] = ()) -> list[Case]:
+    """Table 6: the paper's SDP without skid avoidance, and with Table 2 as printed."""
+    made = [variant(base, name, policies) for name in (labels.GATE_OFF, labels.GATE_TABLE_2)]
+    return [replace(case, keep=keep) for case in made]
+
+
+def frontier(base: Case, priced: Mapping[float, str]) -> list[Case]:
+    """Saving against share changes: what the price of a change does, for each strategy that has one."""
+    rival = [
+        replace(
+            base,
+            strategy="instantaneous_slip",
+            label=f"instantaneous_slip|{power:g} W",
+            settings=base.settings._replace(switching_power_w=power),
+        )
+        for power in FRONTIER_POWERS_W
+    ]
+    bound = [
+        replace(base, strategy="preview", label=f"preview|{cost:g} J", switching_cost_j=cost)
+        for cost in FRONTIER_COSTS_J
+    ]
+    ours = [
+        replace(base, strategy=STRATEGY, label=f"ours|{price:g} J", policy=policy) for price, policy in priced.items()
+    ]
+    return [replace(base, label="ED|"), *rival, *bound, *ours]
+
+
+def robustness(base: Case, policies: Policies) -> list[tuple[str, Case]]:
+    """Cars, roads and sensors that are not what the policy was solved for; each with equal split beside it."""
+    chassis = policies.car(base.idle_drive).params.chassis
+    variants = {"as solved for": base}
+    for factor in (0.8, 1.2):
+        change = Change("chassis", "mass_kg", factor * chassis.mass_kg)
+        variants[f"mass {factor - 1.0:+.0%}"] = replace(base, plant=(change,))
+    for factor in (0.7, 1.3):
+        changes = tuple(
+            Change("chassis", name, factor * getattr(chassis, name))
+            for name in ("drag_coefficient", "rolling_resistance")
+        )
+        variants[f"road load {factor - 1.0:+.0%}"] = replace(base, plant=changes)
+    for true, assumed in ((0.5, 0.9), (0.2, 0.9), (0.9, 0.2)):
+        variants[f"friction {true:g}, assumed {assumed:g}"] = replace(base, friction=true, assumed_friction=assumed)
+    variants["direct-drive hub motor"] = replace(base, plant=HUB_MOTOR)
+    variants["noise 0.1 m/s, 0.3 rad/s"] = replace(base, noise=SensorNoise(0.1, 0.3))
+    made = []
+    for name, case in variants.items():
+        policy = policies.ours(base.idle_drive, case.told_friction)
+        made.append((name, replace(case, label=labels.ED)))
+        made.append((name, replace(case, strategy=STRATEGY, label=labels.OURS, policy=policy)))
+    return made
+
+
+def stops(policies: Policies) -> list[skid.Stop]:
+    """Emergency stops on every road, with and without our policy, under every kind of skid avoidance."""
+    return [
+        skid.Stop(policies.vehicle, IDLE_DRIVES[1], friction, gate_mode, strategy, policy)
+        for friction in paper.FRICTIONS
+        for strategy, policy in (("equal", ""), (STRATEGY, policies.ours(IDLE_DRIVES[1], friction)))
+        for gate_mode in GATE_MODES
+    ]

@@ -1,0 +1,71 @@
+"""The package from Python, as the documentation shows it."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from iwm_power_manager.errors import ConfigError, IwmError
+from iwm_sim import api
+from iwm_sim.closed_loop import COLUMNS
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+@pytest.fixture(scope="module")
+def car():
+    return api.load_car("jalalmaab_2015", idle_drive="drag")
+
+
+@pytest.fixture(scope="module")
+def bank(car):
+    return api.load_bank("policies", car)
+
+
+def test_the_bank_gives_the_policy_the_power_manager_takes(bank):
+    assert sorted(policy.friction for policy in bank.policies) == [0.2, 0.5, 0.9]
+    assert bank.nearest(0.45).friction == 0.5
+
+
+def test_a_share_map_has_the_axes_of_its_policy_and_a_picture(bank):
+    policy = bank.nearest(0.9)
+    power_w, speed_mps, share = api.share_map(policy, previous_share=1.0)
+    assert share.shape == (power_w.size, speed_mps.size)
+    assert share.min() >= 0.0
+    assert share.max() <= 1.0
+    assert not np.array_equal(share, api.share_map(policy, previous_share=0.0)[2])
+    figure = api.plot_share(policy)
+    assert figure.axes[0].get_ylabel() == "Power demand, kW"
+
+
+def test_a_drive_gives_metrics_a_saving_and_a_frame(car, bank):
+    ours = api.drive("nycc", car, 0.9, bank.nearest(0.9), until_s=60.0)
+    equal = api.drive("nycc", car, 0.9, strategy="equal", until_s=60.0)
+    assert (ours.strategy, equal.strategy) == ("sdp_lookahead", "equal")
+    assert ours.saving_percent(equal) > 0.0
+    assert set(ours.columns()) == set(COLUMNS)
+    pd = pytest.importorskip("pandas")
+    frame = ours.frame()
+    assert isinstance(frame, pd.DataFrame)
+    assert frame.index.name == "time_s"
+    np.testing.assert_array_equal(frame["speed_mps"], ours.run["speed_mps"])
+
+
+def test_bad_input_is_one_line(car, bank):
+    with pytest.raises(ConfigError, match="magic"):
+        api.drive("nycc", car, 0.9, strategy="magic")
+    with pytest.raises(ConfigError, match="sdp needs one"):
+        api.drive("nycc", car, 0.9, strategy="sdp")
+    other = api.load_car("jalalmaab_2015", idle_drive="none")
+    with pytest.raises(IwmError, match="was solved for"):
+        api.drive("nycc", other, 0.9, bank.nearest(0.9))
+
+
+@pytest.mark.parametrize("page", ["solver.md", "study.md"])
+def test_what_the_pages_show_runs(page, tmp_path, monkeypatch):
+    snippets = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+    assert snippets
+    monkeypatch.chdir(tmp_path)
+    for snippet in snippets:
+        exec(compile(snippet, page, "exec"), {})
