@@ -34,7 +34,7 @@ from iwm_power_manager.bags.metadata import Topic
 from iwm_power_manager.bags.recording import FAILED, Recording, RecordingOptions, Sample
 from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.bags.writer import WriterOptions
-from iwm_power_manager.errors import BagError, IwmError
+from iwm_power_manager.errors import BagError, IwmError, one_line
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.ros import ending
 from iwm_power_manager.ros.interruption import Interruption
@@ -135,6 +135,7 @@ class Recorder(Node):
             [self.resolve_topic_name(name) for name in values["topics"] if name],
             _pattern(values["regex"]),
             values["depth"],
+            _learn,
         )
         path = Path(values["output"] or datetime.now().strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
         self.recording = Recording(path, _options(values), _custom_data(values))
@@ -312,6 +313,12 @@ class Recorder(Node):
         self._diagnostics.publish(message)
 
 
+def _learn(msgtype: str) -> None:
+    """Have a type's definition at hand: nothing may be imported or compiled while messages are already coming."""
+    with suppress(BagError):  # said when the topic is announced
+        definition_of(msgtype)
+
+
 def _pattern(text: str) -> re.Pattern[str] | None:
     try:
         return re.compile(text) if text else None
@@ -377,26 +384,36 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="recorder",
         usage="recorder [--ros-args -p NAME:=VALUE ... | --params-file FILE | -r FROM:=TO]\n"
-        "       recorder --recover DIR ...",
+        "       recorder --recover BAG ...",
         description="Record topics to a rosbag2 MCAP bag until Ctrl-C, or make a valid bag of what a crash left.",
         epilog=f"parameters:\n{parameters}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--recover", metavar="DIR", nargs="+", help="rebuild index and metadata of bags whose recorder was killed"
+        "--recover",
+        metavar="BAG",
+        nargs="+",
+        help="make valid what a killed recorder left: folders, or single .mcap, .db3, .mcap.zstd files",
     )
     return parser
 
 
-def _recover(folders: Sequence[str]) -> int:
-    for folder in folders:
-        print("\n".join(recover(folder).lines()))
-    return 0
+def _recover(bags: Sequence[str]) -> int:
+    code = 0
+    for bag in bags:
+        try:
+            print("\n".join(map(one_line, recover(bag).lines())))
+        except IwmError as error:
+            print(f"recorder: {error}", file=sys.stderr)
+            code = 1
+    return code
 
 
 def _run_node(arguments: list[str]) -> int:
     interruption = Interruption(started=True)  # a bag that has been created is closed in order
     interruption.install()
+    for kind in {*TOPIC_TYPES.values(), DiagnosticArray}:
+        _learn(f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}")
     try:
         # rclpy's own handlers would close DDS before the last messages are taken.
         rclpy.init(args=["recorder", *arguments], signal_handler_options=SignalHandlerOptions.NO)

@@ -13,7 +13,7 @@ import importlib
 import re
 import struct
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
@@ -75,6 +75,7 @@ class RawSubscriptions:
     names : full topic names
     pattern : regular expression a full topic name has to match as a whole; None for none
     depth : messages each subscription keeps until they are taken
+    prepare : called with the type of a topic before it is subscribed: what takes long and is needed for its messages
 
     Attributes
     ----------
@@ -82,9 +83,15 @@ class RawSubscriptions:
     """
 
     def __init__(
-        self, node: Node, names: Iterable[str], pattern: re.Pattern[str] | None = None, depth: int = 2000
+        self,
+        node: Node,
+        names: Iterable[str],
+        pattern: re.Pattern[str] | None = None,
+        depth: int = 2000,
+        prepare: Callable[[str], None] = lambda _: None,
     ) -> None:
         self._node = node
+        self._prepare = prepare
         self._names = frozenset(names)
         self._pattern = pattern
         self._depth = depth
@@ -108,6 +115,7 @@ class RawSubscriptions:
                 topic = self._topics.get(name)
                 if topic is None:
                     topic = _Topic(len(self._topics), name, _message_class(name, types))
+                    self._prepare(types[0])
                     self._subscribe(topic, publishers)
                     self._topics[name] = topic
                     found.append(_found(topic, types[0], publishers))

@@ -90,6 +90,7 @@ def types_of(msgtype: str, encoding: str = "", text: str = "", sample: bytes = b
     return next((candidate for candidate in candidates if candidate.fits(sample)), found)
 
 
+@lru_cache(maxsize=512)
 def definition_of(msgtype: str) -> tuple[str, str]:
     """Definition (`ros2msg` text with all dependencies) and RIHS01 hash of an installed type.
 
