@@ -175,7 +175,7 @@ class McapSource:
             if summary is None or summary.statistics is None or not summary.chunk_indexes:
                 return False
             for record in reader.iter_metadata():
-                self.metadata[record.name] = record.metadata
+                self.metadata.setdefault(record.name, {}).update(record.metadata)
         except Exception:  # noqa: BLE001 - the package lets through whatever damaged bytes make it raise
             self.damage.append("its summary is damaged")
             return False
@@ -227,7 +227,7 @@ class McapSource:
                     self.definitions.take(record.opcode, self.body(record))
                 elif record.opcode == Opcode.METADATA:
                     found = read_record(Metadata, self.body(record))
-                    self.metadata[found.name] = found.metadata
+                    self.metadata.setdefault(found.name, {}).update(found.metadata)
                 elif record.opcode == UNREADABLE:
                     self._note_stretch(record)
             except BagError as error:
