@@ -35,9 +35,9 @@ from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.run import Replay, ReplayOutput
 from iwm_power_manager.signals.contract import WHEEL_NAMES
-from iwm_power_manager.signals.definitions import definition_of, typestore
 from iwm_power_manager.signals.mapping import JOINT_STATE, load_mapping
 from iwm_power_manager.signals.readings import joint_state_writer
+from iwm_power_manager.signals.types import definition_of, standard_types
 
 TWIST, FLOAT64 = "geometry_msgs/msg/TwistStamped", "std_msgs/msg/Float64"
 TOPICS = 5
@@ -134,7 +134,7 @@ def _write(folder: Path, count: int) -> dict[str, float]:
         writer.set_compression(mode, CompressionFormat.ZSTD)
         with writer:
             connections = [
-                writer.add_connection(f"/topic_{i}", JOINT_STATE, typestore=typestore()) for i in range(TOPICS)
+                writer.add_connection(f"/topic_{i}", JOINT_STATE, typestore=standard_types()) for i in range(TOPICS)
             ]
             for i in range(count):
                 writer.write(connections[i % TOPICS], i * 200_000, MESSAGES[i % 1000])
@@ -249,7 +249,7 @@ def _read(folder: Path, steps: int) -> dict[str, float]:
 
 def _write_inputs(path: Path, steps: int) -> None:
     """Inputs of a drive as the simulator publishes them: nothing that is real, everything at its real size."""
-    types = typestore().types
+    types = standard_types().types
     stamp_type, header_type = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
     vector, battery_type = types["geometry_msgs/msg/Vector3"], types["sensor_msgs/msg/BatteryState"]
     wheels = joint_state_writer(WHEEL_NAMES, "velocity")
@@ -300,7 +300,11 @@ def _write_inputs(path: Path, steps: int) -> None:
                 "/power_demand": types[FLOAT64](demand),
             }
             for order, (name, message) in enumerate(content.items()):
-                data = message if isinstance(message, bytes) else bytes(typestore().serialize_cdr(message, kinds[name]))
+                data = (
+                    message
+                    if isinstance(message, bytes)
+                    else bytes(standard_types().serialize_cdr(message, kinds[name]))
+                )
                 bag.write(numbers[name], now + order * 1000, data)
 
 

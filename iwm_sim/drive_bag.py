@@ -12,7 +12,7 @@ import numpy as np
 
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.errors import BagError
-from iwm_power_manager.signals.definitions import typestore
+from iwm_power_manager.signals.types import standard_types
 from iwm_sim.closed_loop import COLUMNS, Run
 from iwm_sim.drive import LAW_COLUMNS
 
@@ -106,7 +106,7 @@ def with_decisions(run: Run, bag: DriveBag) -> Run:
 
 def _layout(path: Path, kind: str, data: bytes) -> tuple[np.ndarray, int]:
     """Places of the law's columns among the signals, and the number of signals; the same for every message of a bag."""
-    message: Any = typestore().deserialize_cdr(data, kind)
+    message: Any = standard_types().deserialize_cdr(data, kind)
     names = list(message.name)
     missing = [name for name in LAW_COLUMNS if name not in names]
     if missing:

@@ -22,9 +22,9 @@ from iwm_power_manager.policy import choose, load_policy_bank
 from iwm_power_manager.replay.run import COMPUTED
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.contract import WHEEL_NAMES
-from iwm_power_manager.signals.definitions import definition_of, typestore
 from iwm_power_manager.signals.mapping import JOINT_STATE
 from iwm_power_manager.signals.readings import joint_state_writer
+from iwm_power_manager.signals.types import definition_of, standard_types
 from iwm_power_manager.vehicle import load_vehicle
 
 FLOAT64 = "std_msgs/msg/Float64"
@@ -132,14 +132,14 @@ def twist(stamp_ns: int, speed_mps: float) -> bytes:
 
 def battery(stamp_ns: int, soc: float, temperature_c: float = 25.0) -> bytes:
     """CDR of a BatteryState."""
-    types = typestore().types
+    types = standard_types().types
     stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
     empty = np.zeros(0, dtype=np.float32)
     message = types[BATTERY](
         header, 230.0, temperature_c, 0.0, math.nan, math.nan, math.nan, soc, 2, 0, 3, True, empty, empty, "", ""
     )
-    return bytes(typestore().serialize_cdr(message, BATTERY))
+    return bytes(standard_types().serialize_cdr(message, BATTERY))
 
 
 def write_drive(path: Path, speed_mps: Iterable[float], demand_w: Iterable[float]) -> None:

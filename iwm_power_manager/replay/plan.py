@@ -14,13 +14,16 @@ from iwm_power_manager.control.types import WHEEL_NAMES
 from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.policy import Policy, choose, load_policy_bank
-from iwm_power_manager.share import resolve
+from iwm_power_manager.share import resolve, roots
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
 DEFAULT_VEHICLE = "config/vehicles/jalalmaab_2015.yaml"
 DEFAULT_POLICY = "policies"
 DEFAULT_FRICTION = 0.9
 DEFAULT_RATE_HZ = 100.0
+
+#: No honest parameter is larger.
+_LARGEST = 1e9
 
 _NODE = "/power_manager"
 _PARAMETERS = "parameters "
@@ -52,10 +55,12 @@ class PolicyBank:
     path : file or folder; "" for none
     rule : coefficients of the strategy `rule`
     vehicle : the car they have to be solved for
+    why_none : what to say where a policy is needed and there is none
     """
 
-    def __init__(self, path: str, rule: Sequence[float], vehicle: Vehicle) -> None:
+    def __init__(self, path: str, rule: Sequence[float], vehicle: Vehicle, why_none: str = "") -> None:
         self._path = path
+        self._why_none = why_none or "the strategy needs a policy; name one with --policy"
         self._rule = tuple(rule)
         self._vehicle = vehicle
         self._bank: list[Policy] | None = None
@@ -90,7 +95,7 @@ class PolicyBank:
     def _loaded(self) -> list[Policy]:
         if self._bank is None:
             if not self._path:
-                raise PolicyError("the strategy needs a policy; name one with --policy")
+                raise PolicyError(self._why_none)
             self._bank = load_policy_bank(resolve(self._path), self._vehicle)
         return self._bank
 
@@ -130,28 +135,34 @@ def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
     """
     recorded = recorded_parameters(custom_data)
     idle_drive = recorded.get("idle_drive") or None if choice.vehicle is None else None
-    vehicle = load_vehicle(resolve(choice.vehicle or recorded.get("vehicle_file") or DEFAULT_VEHICLE), idle_drive)
+    vehicle_file = choice.vehicle or _packaged(recorded.get("vehicle_file"), "--vehicle") or DEFAULT_VEHICLE
+    vehicle = load_vehicle(resolve(vehicle_file), idle_drive)
     changes = {}
     for text in choice.settings:
         name, _, value = text.partition("=")
         changes[name] = law_settings.parse("--set", name, value)
     if choice.strategy is not None:
         changes["strategy"] = law_settings.parse("--strategy", "strategy", choice.strategy)
-    settings = DEFAULTS._replace(**law_settings.from_shown(recorded))._replace(**changes)
+    settings = DEFAULTS._replace(**_recorded_settings(recorded))._replace(**changes)
     problem = law_settings.check_together(settings._asdict()) if changes else ""
     if problem:
         raise ConfigError("--set", *problem.split(": ", 1))
-    wheel_names = tuple(recorded.get("wheel_names") or WHEEL_NAMES)
-    policy = choice.policy if choice.policy is not None else recorded.get("policy_file", DEFAULT_POLICY)
+    if choice.policy is not None:
+        policy, why_none = choice.policy, ""
+    else:
+        try:
+            policy, why_none = _packaged(recorded.get("policy_file", DEFAULT_POLICY), "--policy"), ""
+        except ConfigError as error:
+            policy, why_none = "", str(error)
     return Plan(
         vehicle,
-        PolicyBank(str(policy), recorded.get("rule") or (), vehicle),
+        PolicyBank(policy, _numbers(recorded.get("rule")), vehicle, why_none),
         changes,
         settings,
-        choice.friction if choice.friction is not None else float(recorded.get("friction", DEFAULT_FRICTION)),
+        choice.friction if choice.friction is not None else _number(recorded, "friction", DEFAULT_FRICTION),
         choice.friction is None,
-        wheel_names,
-        1.0 / float(recorded.get("rate_hz", DEFAULT_RATE_HZ)),
+        _wheel_names(recorded.get("wheel_names")),
+        1.0 / _number(recorded, "rate_hz", DEFAULT_RATE_HZ),
     )
 
 
@@ -161,8 +172,54 @@ def recorded_parameters(custom_data: Mapping[str, str]) -> dict[str, Any]:
         if key.startswith(_PARAMETERS) and key.endswith(_NODE):
             try:
                 found = json.loads(text)
-            except ValueError:
+            except (ValueError, RecursionError):
                 continue
             if isinstance(found, dict):
                 return found
     return {}
+
+
+def _packaged(name: object, option: str) -> str:
+    """A file of the package that the bag names; it may name no other, because a bag may come from anybody.
+
+    Raises
+    ------
+    ConfigError
+        The drive was recorded with another file, which only the user can give.
+    """
+    if not name:
+        return ""
+    try:
+        path = resolve(str(name)).resolve()
+        folders = [root.resolve() / folder for root in roots() for folder in ("config", "policies")]
+        if path.exists() and any(path.is_relative_to(folder) for folder in folders):
+            return str(path)
+    except (OSError, ValueError, RuntimeError):
+        pass  # no file can have such a name
+    raise ConfigError(option, "", f"the drive was recorded with {str(name)[:200]!r}; give that file, or another")
+
+
+def _recorded_settings(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings among the recorded parameters, checked like anybody's."""
+    known = {name: recorded[name] for name in Settings._fields if name in recorded}
+    texts = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in known.items()}
+    return {name: law_settings.parse("parameters in the bag", name, text) for name, text in texts.items()}
+
+
+def _number(recorded: Mapping[str, Any], name: str, default: float) -> float:
+    value = recorded.get(name, default)
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and 0.0 < value < _LARGEST
+    return float(value) if usable else default
+
+
+def _numbers(values: object) -> tuple[float, ...]:
+    if not isinstance(values, list):
+        return ()
+    usable = all(isinstance(value, int | float) and abs(value) < _LARGEST for value in values)
+    return tuple(map(float, values)) if usable else ()
+
+
+def _wheel_names(names: object) -> tuple[str, ...]:
+    """The wheels' names; this project's own, if they are none."""
+    usable = isinstance(names, list) and len(names) == len(WHEEL_NAMES) and all(isinstance(name, str) for name in names)
+    return tuple(names) if usable and isinstance(names, list) else WHEEL_NAMES

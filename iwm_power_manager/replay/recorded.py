@@ -5,7 +5,9 @@ The solver learns the demand's Markov chain from the arrays.
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iwm_power_manager.bags.metadata import Topic
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.errors import BagError
@@ -23,6 +24,10 @@ from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.signals.mapping import DEMANDS, PEDALS, SignalMapping, load_mapping, topic_named
 from iwm_power_manager.signals.readings import Assembly, DemandReading, Reading, TopicReader, topic_readers
 from iwm_power_manager.signals.types import Types, types_of
+
+#: Messages from a bag's start that show whether its stamps advance, and how many may have the same one.
+_PROBE_MESSAGES = 2000
+_STANDING = 10
 
 FloatArray = NDArray[np.float64]
 
@@ -75,7 +80,9 @@ class SignalStream:
     Attributes
     ----------
     signals : those the bag holds; pedals only where it holds no other demand
-    bad_messages : messages that could not be decoded, or held no number that can be used, so far
+    taken, bad : messages by topic so far: of all, and those that could not be decoded or held no number of use
+    without : messages by topic and wheels they had no number for
+    problems : topics that cannot be read, a line each
     """
 
     def __init__(
@@ -85,11 +92,23 @@ class SignalStream:
         vehicle: VehicleParams | None = None,
         signals: Sequence[str] = (),
     ) -> None:
-        self.bad_messages = 0
+        self.taken: Counter[str] = Counter()
+        self.bad: Counter[str] = Counter()
+        self.without: Counter[str] = Counter()
+        self.problems: list[str] = []
+        self._by_stamp = True
         self._bag = bag
-        named = {topic: topic_named(topic, bag.topics) for topic in mapping.topics()}
-        held = {topic: name for topic, name in named.items() if name is not None}
-        types = {topic: _types(bag.topics[name]) for topic, name in held.items()}
+        held: dict[str, str] = {}
+        types: dict[str, Types] = {}
+        for topic in mapping.topics():
+            name = topic_named(topic, bag.topics)
+            if name is None:
+                continue
+            try:
+                types[topic] = _types(bag, name)
+                held[topic] = name
+            except BagError as error:
+                self.problems.append(str(error))
         wanted = [
             signal
             for signal, sources in mapping.sources.items()
@@ -100,6 +119,31 @@ class SignalStream:
         self.signals = set(wanted)
         readers = topic_readers(mapping, types, Assembly(WHEEL_NAMES, vehicle), wanted) if wanted else {}
         self._readers: dict[str, TopicReader] = {held[topic]: reader for topic, reader in readers.items()}
+
+    @property
+    def bad_messages(self) -> int:
+        """Bad messages of all topics."""
+        return self.bad.total()
+
+    def use_log_times(self) -> str:
+        """Look at the bag's first messages: where header stamps do not advance, log times are used from here on.
+
+        Returns the line that says so; "" where stamps are used.
+        """
+        stamps: dict[str, list[int]] = {}
+        for message in itertools.islice(self._bag.messages(), _PROBE_MESSAGES):
+            for value in self.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns):
+                if value.stamped:
+                    stamps.setdefault(message.topic, []).append(value.reading.stamp_ns)
+        self.taken.clear()
+        self.bad.clear()
+        standing = sorted(
+            topic for topic, found in stamps.items() if len(found) > 2 and len(set(found)) * _STANDING < len(found)
+        )
+        if not standing:
+            return ""
+        self._by_stamp = False
+        return f"the header stamps of {', '.join(standing)} do not advance: log times are used"
 
     @property
     def topics(self) -> set[str]:
@@ -115,25 +159,36 @@ class SignalStream:
         reader = self._readers.get(topic)
         if reader is None:
             return []
+        self.taken[topic] += 1
         try:
             readings = reader.read(data, log_time_ns)
         except UnreadableError:
-            self.bad_messages += 1
+            self.bad[topic] += 1
             return []
         for reading in readings:
             if not _usable(reading):
-                self.bad_messages += 1
+                self.bad[topic] += 1
                 return []
+            if isinstance(reading, JointReading) and not all(map(math.isfinite, reading.values)):
+                missing = [name for name, value in zip(WHEEL_NAMES, reading.values, strict=True) if math.isnan(value)]
+                self.without[f"{topic}: {', '.join(missing)}"] += 1
         stamped = reader.stamped
+        if stamped and not self._by_stamp:
+            stamped = False
+            readings = tuple(reading._replace(stamp_ns=log_time_ns) for reading in readings)
         return [Recorded(log_time_ns, publish_time_ns, stamped, reading) for reading in readings]
 
 
-def _types(topic: Topic) -> Types:
+def _types(bag: BagReader, name: str) -> Types:
     """The types of a recorded topic by the definition in its bag."""
+    topic = bag.topics[name]
+    sample = b""
+    if "wstring" in topic.definition:  # how wide its characters are, only a message tells
+        sample = next((message.data for message in bag.messages() if message.topic == name), b"")
     try:
-        return types_of(topic.type, topic.encoding, topic.definition)
+        return types_of(topic.type, topic.encoding, topic.definition, sample)
     except BagError as error:
-        raise BagError(f"{topic.name}: {error}") from None
+        raise BagError(f"{name}: {error}") from None
 
 
 def _usable(reading: Reading) -> bool:
@@ -183,6 +238,7 @@ def read_signal(
                 speeds.append(speed)
         damage = reader.damage
         bad = stream.bad_messages
+        damage = [*damage, *stream.problems]
     if not demands:
         raise BagError(f"{bag}: holds no power demand with a speed before it")
     time_ns = _times(np.array(log_times, dtype=np.int64), np.array(stamps, dtype=np.int64))
@@ -191,13 +247,16 @@ def read_signal(
     return RecordedDrive(time_s, np.array(demands)[keep], np.array(speeds)[keep], bad, damage)
 
 
-def check_signals(reader: BagReader, mapping: SignalMapping, stream: SignalStream) -> None:
-    """Refuse a bag without speed or demand, in one line that says what it holds instead."""
+def check_signals(reader: BagReader, mapping: SignalMapping, stream: SignalStream, wheels: bool = False) -> None:
+    """Refuse a bag without speed or demand, or with `wheels` without wheel speeds; the line says what it holds."""
     held = ", ".join(sorted(reader.topics)) or "no topic"
+    held += "".join(f"; {problem}" for problem in stream.problems)
     if "speed" not in stream.signals:
         raise BagError(f"{reader.path}: holds no topic that {mapping.path} maps to speed; it holds {held}")
     if not stream.signals.intersection(DEMANDS) and not stream.signals.issuperset(PEDALS):
         raise BagError(f"{reader.path}: holds no topic that {mapping.path} maps to power_demand; it holds {held}")
+    if wheels and "wheel_speed" not in stream.signals:
+        raise BagError(f"{reader.path}: holds no topic that {mapping.path} maps to wheel_speed; it holds {held}")
 
 
 def _advancing(time_ns: NDArray[np.int64]) -> NDArray[np.intp]:

@@ -32,6 +32,10 @@ STATE = "power_manager/state"
 COMPUTED = (MOTOR_COMMAND, FRICTION_COMMAND, STATE)
 
 _PROGRESS_EVERY = 2000
+#: Readings from the bag's start that show whether its messages come in sets of one stamp.
+_PROBE_READINGS = 1000
+#: Below this share of the messages of the busiest topic, a replay says that it made few steps.
+_FEW_STEPS = 0.1
 _FIRST_DECIDED = SIGNAL_NAMES.index(DECIDED_NAMES[0])
 
 
@@ -40,6 +44,7 @@ class ReplayReport(NamedTuple):
 
     Attributes
     ----------
+    notes : what was done other than asked, a line each
     exact : steps were repeated from the recorded state; else made from the inputs
     messages : read
     steps : control steps taken
@@ -53,6 +58,7 @@ class ReplayReport(NamedTuple):
     comparison : recomputed against recorded, by topic
     """
 
+    notes: list[str]
     exact: bool
     messages: int
     steps: int
@@ -92,6 +98,7 @@ class Replay:
         self._reconstructed: ReconstructedSteps | None = None
         self._stream: SignalStream | None = None
         self._bad_messages = 0
+        self._notes: list[str] = []
         self._messages = 0
         self._steps = 0
         self._stamps = (0, 0)
@@ -107,12 +114,12 @@ class Replay:
             self._recorded = RecordedSteps(plan)
         else:
             self._stream = SignalStream(bag, mapping, plan.vehicle.params)
-            check_signals(bag, mapping, self._stream)
-            if "wheel_speed" not in self._stream.signals:
-                raise BagError(f"{bag.path}: holds no topic that {mapping.path} maps to wheel_speed")
-            probe = itertools.islice(self._stream, 1000)
-            self._reconstructed = ReconstructedSteps(plan, probe)
-            self._stream.bad_messages = 0
+            check_signals(bag, mapping, self._stream, wheels=True)
+            self._notes = [*self._stream.problems, *filter(None, [self._stream.use_log_times()])]
+            self._reconstructed = ReconstructedSteps(plan, itertools.islice(self._stream, _PROBE_READINGS))
+            self._stream.taken.clear()
+            self._stream.bad.clear()
+            self._stream.without.clear()
 
     @property
     def exact(self) -> bool:
@@ -140,6 +147,7 @@ class Replay:
         """What has been done so far."""
         source = self._recorded or self._reconstructed
         return ReplayReport(
+            [*self._notes, *self._lost_wheels(), *self._too_few_steps()],
             self.exact,
             self._messages,
             self._steps,
@@ -152,6 +160,36 @@ class Replay:
             self._bag.damage,
             [result for comparer in self._comparers.values() if (result := comparer.result()).has_record],
         )
+
+    def why_no_step(self) -> str:
+        """Why the bag gave no control step, topic by topic."""
+        if self._stream is None or self._reconstructed is None:
+            return f"{self._state_topic}: {self._bad_messages} messages that cannot be read"
+        parts = []
+        for topic in sorted(self._stream.topics):
+            part = f"{topic}: {self._stream.taken[topic]} messages"
+            if self._stream.bad[topic]:
+                part += f", {self._stream.bad[topic]} of them bad"
+            parts.append(part)
+        for name, reasons in self._reconstructed.dropped.items():
+            parts.append(f"{name} not believed: " + ", ".join(f"{count} {reason}" for reason, count in reasons.items()))
+        for reason, count in self._reconstructed.faults.items():
+            parts.append(f"{count} without a command: {reason}")
+        return "; ".join([*parts, *self._notes]) or "no message"
+
+    def _lost_wheels(self) -> list[str]:
+        """A line for each set of wheels that messages had no number for."""
+        without = self._stream.without if self._stream is not None else {}
+        return [f"{which} has no number in {count} messages: lost, as in the node" for which, count in without.items()]
+
+    def _too_few_steps(self) -> list[str]:
+        """A line, if the bag gave far fewer steps than it holds wheel speeds."""
+        if self._stream is None or not self._steps:
+            return []
+        wheels = max(self._stream.taken[topic] for topic in self._stream.topics)
+        if self._steps > _FEW_STEPS * wheels:
+            return []
+        return [f"only {self._steps} steps of {wheels} messages: {self.why_no_step()}"]
 
     def _take(self, message: Message) -> list[ReplayedStep]:
         known = self._decoders.get(message.topic)

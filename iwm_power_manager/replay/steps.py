@@ -42,6 +42,7 @@ _PAUSE_S = 1.0
 #: Values from the start of a bag that show whether its messages come in sets of one stamp.
 _PROBE_VALUES = 400
 
+
 class ReplayedStep(NamedTuple):
     """One step of the law.
 

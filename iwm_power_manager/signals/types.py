@@ -114,7 +114,7 @@ def _types_of(msgtype: str, encoding: str, text: str, wide: str) -> Types:
         given = _needed(name, known, wide)
         _measure(name, given)
         store = Typestore()
-        jazzy = _jazzy()
+        jazzy = standard_types()
         for part, definition in given.items():
             if part not in known:
                 store.fielddefs[part], store.types[part] = definition, jazzy.types[part]
@@ -128,7 +128,8 @@ def _types_of(msgtype: str, encoding: str, text: str, wide: str) -> Types:
 
 
 @lru_cache(maxsize=1)
-def _jazzy() -> Typestore:
+def standard_types() -> Typestore:
+    """All types of ROS 2 Jazzy, as rosbags carries them."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
@@ -164,14 +165,14 @@ def _needed(name: str, known: dict[str, Any], wide: str) -> dict[str, Any]:
         part = waiting.pop()
         if part in needed:
             continue
-        if part not in known and part not in _jazzy().fielddefs:
+        if part not in known and part not in standard_types().fielddefs:
             known.update(_installed(part, name))
         if part in known:
             constants, fields = known[part]
             known[part] = constants, [(field, _without_wstring(description, wide)) for field, description in fields]
             needed[part] = known[part]
         else:
-            needed[part] = _jazzy().fielddefs[part]
+            needed[part] = standard_types().fielddefs[part]
         waiting += [inner for _, description in needed[part][1] if (inner := _named(description))]
         if len(needed) > MAX_FIELDS:
             raise BagError(f"needs more than {MAX_FIELDS} other types")

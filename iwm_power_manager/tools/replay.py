@@ -22,7 +22,7 @@ from iwm_power_manager import __version__
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.control.strategies import drivable, name_of
-from iwm_power_manager.errors import BagError, ConfigError, IwmError
+from iwm_power_manager.errors import BagError, ConfigError, IwmError, one_line
 from iwm_power_manager.files import atomic_write, check_number
 from iwm_power_manager.replay.plan import Choice, Plan, make_plan
 from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds
@@ -142,7 +142,7 @@ def _replay(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace)
                 if output is not None:
                     output.write(message, steps)
         if not replay.report().steps:
-            raise BagError(f"{bag.path}: gave no control step: speed, wheel speeds and demand never came together")
+            raise BagError(f"{bag.path}: gave no control step: {replay.why_no_step()}")
     except IwmError:
         if writer is not None:  # what there is of it is of no use, and would be in the way of the next attempt
             writer.abandon()
@@ -170,21 +170,25 @@ def _what_if(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace
     plans = [(name, _plan(bag, options, options.what_if, name)) for name in dict.fromkeys(names)]
     with _progress(bag, options, len(plans)) as progress:
         rows = what_if(bag, plans, mapping, progress)
+    savings = [row.saving_percent(rows[0]) for row in rows]
     lines = [
         f"{bag.path}: open-loop estimate for {plans[0][1].vehicle.name}, idle drive {plans[0][1].vehicle.idle_drive}",
         f"  {'':20} {'Wh':>9} {'Wh/km':>8} {'at wheels':>10} {'brakes':>8} {'idle drag':>9} {'saving':>8}",
-        *(_consumption_line(row, rows[0]) for row in rows),
-        "  speed, wheel speeds and demand stay as recorded: it tells losses, not how slip or the driver would differ",
+        *(_consumption_line(row, saving) for row, saving in zip(rows, savings, strict=True)),
+        f"  at the force of {rows[0].label}, step by step; it tells losses, not how slip or the driver would differ",
     ]
-    _show(lines, {"bag": str(bag.path), "rows": [row._asdict() for row in rows], "damage": bag.damage}, options)
+    if None in savings:
+        lines.append("  no saving where the motors could not give that force: the work at the wheels is another")
+    lines += [f"  damaged: {line}" for line in bag.damage]
+    found = [{**row._asdict(), "saving_percent": saving} for row, saving in zip(rows, savings, strict=True)]
+    _show(lines, {"bag": str(bag.path), "rows": found, "damage": bag.damage}, options)
     return DONE
 
 
-def _consumption_line(row: Consumption, reference: Consumption) -> str:
-    saving = 100.0 * (1.0 - row.chemical_wh / reference.chemical_wh) if reference.chemical_wh else float("nan")
+def _consumption_line(row: Consumption, saving: float | None) -> str:
     return (
         f"  {row.label:20} {row.chemical_wh:9.2f} {row.wh_per_km:8.2f} {row.wheel_work_wh:10.2f} "
-        f"{row.friction_wh:8.2f} {row.idle_drag_wh:9.2f} {saving:7.2f}%"
+        f"{row.friction_wh:8.2f} {row.idle_drag_wh:9.2f} " + ("       –" if saving is None else f"{saving:7.2f}%")
     )
 
 
@@ -245,6 +249,7 @@ def _report_lines(bag: BagReader, report: ReplayReport, elapsed_s: float) -> lis
         f"{bag.path}: {report.messages} messages, {report.steps} steps over {span_s:.2f} s, {how}, "
         f"in {elapsed_s:.2f} s ({report.messages / max(elapsed_s, 1e-9):.0f} messages/s)"
     ]
+    lines += [f"  {note}" for note in report.notes]
     if report.gaps:
         lines.append(f"  {report.gaps} time(s) steps before are not in the bag: the law's memory there is unknown")
     if report.restarts:
@@ -283,7 +288,7 @@ def _show(lines: list[str], result: dict[str, Any], options: argparse.Namespace)
     if options.json == "-":
         print(text)
         return
-    print("\n".join(lines))
+    print("\n".join(map(one_line, lines)))
     if options.json:
         atomic_write(Path(options.json), (text + "\n").encode())
 

@@ -17,7 +17,7 @@ from iwm_power_manager.bags.metadata import parse_qos
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.errors import BagError
-from iwm_power_manager.signals.definitions import typestore
+from iwm_power_manager.signals.types import standard_types
 
 
 def written_by_rosbags(
@@ -27,7 +27,7 @@ def written_by_rosbags(
     writer.set_compression(mode, CompressionFormat.ZSTD)
     writer.set_custom_data("key", "value")
     with writer:
-        connection = writer.add_connection("/a", FLOAT64, typestore=typestore())
+        connection = writer.add_connection("/a", FLOAT64, typestore=standard_types())
         for i in range(100):
             writer.write(connection, 1000 + i, float64(i))
     return path
@@ -128,7 +128,7 @@ def test_a_truncated_sqlite_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> Non
     path = tmp_path / "bag"
     writer = Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3)
     with writer:
-        connection = writer.add_connection("/a", FLOAT64, typestore=typestore())
+        connection = writer.add_connection("/a", FLOAT64, typestore=standard_types())
         for i in range(20_000):
             writer.write(connection, 1000 + i, float64(i))
     database = path / "bag.db3"
@@ -158,7 +158,7 @@ def test_a_truncated_compressed_file_is_read_as_far_as_it_goes(tmp_path: Path) -
     writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.FILE, CompressionFormat.ZSTD)
     with writer:
-        connection = writer.add_connection("/a", FLOAT64, typestore=typestore())
+        connection = writer.add_connection("/a", FLOAT64, typestore=standard_types())
         for i in range(5000):
             writer.write(connection, 1000 + i, random.Random(i).randbytes(1000))
     (packed,) = path.glob("*.zstd")

@@ -22,8 +22,8 @@ from iwm_power_manager.replay.compare import TopicComparer
 from iwm_power_manager.replay.plan import Choice, make_plan, recorded_parameters
 from iwm_power_manager.replay.run import Replay
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.definitions import typestore
 from iwm_power_manager.signals.mapping import load_mapping
+from iwm_power_manager.signals.types import standard_types
 from iwm_power_manager.tools.replay import BAD_INPUT, DIFFERENT, DONE, main
 
 COUNT = 150
@@ -128,9 +128,9 @@ def test_a_policy_changed_in_its_place_is_caught(tmp_path: Path, capsys: pytest.
     policy = load_policy(share_path(f"policies/{POLICY}"))
     save_policy(policy, file)
     drive = ScriptedDrive("sdp", file).write(tmp_path / "drive", COUNT)
-    assert main([str(drive), "--compare"]) == DONE
+    assert main([str(drive), "--compare", "--policy", str(file)]) == DONE
     save_policy(dataclasses.replace(policy, front_share=1.0 - policy.front_share), file)
-    assert main([str(drive), "--compare"]) == DIFFERENT
+    assert main([str(drive), "--compare", "--policy", str(file)]) == DIFFERENT
     assert "first at message" in capsys.readouterr().out
 
 
@@ -139,10 +139,10 @@ def test_another_policy_that_decides_the_same_is_named(tmp_path: Path, capsys: p
     policy = load_policy(share_path(f"policies/{POLICY}"))
     save_policy(policy, file)
     drive = ScriptedDrive("sdp", file).write(tmp_path / "drive", 20, policy_sha256=content_sha256(file))
-    assert main([str(drive), "--compare"]) == DONE
+    assert main([str(drive), "--compare", "--policy", str(file)]) == DONE
     assert "not the one that was recorded" not in capsys.readouterr().out
     save_policy(dataclasses.replace(policy, package_version="0"), file)
-    assert main([str(drive), "--compare"]) == DONE
+    assert main([str(drive), "--compare", "--policy", str(file)]) == DONE
     assert "the policy is not the one that was recorded" in capsys.readouterr().out
 
 
@@ -251,12 +251,12 @@ def test_a_damaged_bag_is_replayed_as_far_as_it_goes(
 def foreign_bag(path: Path, count: int) -> Path:
     """Another car: odometry, wheels in rpm by other names, demand in kW as Float32; sqlite3, 50 Hz, no lock-step."""
     script = ScriptedDrive(STRATEGY)
-    types = typestore().types
+    types = standard_types().types
     stamp_type, header_type = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
     with Writer(path, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        odometry = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=typestore())
-        wheels = writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=typestore())
-        demand = writer.add_connection("/demand", "std_msgs/msg/Float32", typestore=typestore())
+        odometry = writer.add_connection("/odom", "nav_msgs/msg/Odometry", typestore=standard_types())
+        wheels = writer.add_connection("/joint_states", "sensor_msgs/msg/JointState", typestore=standard_types())
+        demand = writer.add_connection("/demand", "std_msgs/msg/Float32", typestore=standard_types())
         for i in range(count):
             now = i * 20_000_000
             stamp = stamp_type(now // 10**9, now % 10**9)
@@ -274,13 +274,13 @@ def foreign_bag(path: Path, count: int) -> Path:
             )
             rpm = np.array([radps[k] for k in (3, 0, 2, 1)]) * 30.0 / np.pi
             joint = types["sensor_msgs/msg/JointState"](header, ["d", "a", "c", "b"], np.zeros(0), rpm, np.zeros(0))
-            writer.write(odometry, now + 3_000_000, typestore().serialize_cdr(message, "nav_msgs/msg/Odometry"))
+            writer.write(odometry, now + 3_000_000, standard_types().serialize_cdr(message, "nav_msgs/msg/Odometry"))
             writer.write(
                 demand,
                 now + 4_000_000,
-                typestore().serialize_cdr(types["std_msgs/msg/Float32"](watts / 1000.0), "std_msgs/msg/Float32"),
+                standard_types().serialize_cdr(types["std_msgs/msg/Float32"](watts / 1000.0), "std_msgs/msg/Float32"),
             )
-            writer.write(wheels, now + 5_000_000, typestore().serialize_cdr(joint, "sensor_msgs/msg/JointState"))
+            writer.write(wheels, now + 5_000_000, standard_types().serialize_cdr(joint, "sensor_msgs/msg/JointState"))
     return path
 
 

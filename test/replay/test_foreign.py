@@ -1,0 +1,207 @@
+"""Replay of other cars' and other recorders' bags: the right steps, or one line that says why not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zstandard
+
+import foreign_bags as foreign
+from foreign_bags import CHANNELS, COUNT, DEMAND, JOINTS, LINE, SPEED, drive, write_bag, write_mcap, write_sqlite
+from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.replay.plan import Choice, make_plan
+from iwm_power_manager.replay.recorded import read_signal
+from iwm_power_manager.replay.run import Replay
+from iwm_power_manager.signals.mapping import load_mapping
+from iwm_power_manager.tools.replay import BAD_INPUT, DONE, main
+
+FORKED = f"geometry_msgs/Twist twist\n{LINE}\nMSG: geometry_msgs/Twist\nfloat64 x\n"
+
+
+@pytest.fixture
+def mapping(tmp_path: Path) -> Path:
+    path = tmp_path / "mapping.yaml"
+    path.write_text(foreign.MAPPING)
+    return path
+
+
+def replayed(bag: Path, mapping: Path) -> tuple[Any, list[float]]:
+    """Report of a replay with equal split, and the speeds the law took."""
+    with BagReader(bag) as reader:
+        replay = Replay(reader, make_plan(Choice(strategy="equal"), {}), load_mapping(mapping))
+        speeds = [step.values[0] for _, steps in replay.steps() for step in steps]
+        return replay.report(), speeds
+
+
+def with_speed(**changes: str) -> list[foreign.Channel]:
+    return [SPEED._replace(**changes), DEMAND, JOINTS]
+
+
+@pytest.mark.parametrize(
+    "channels",
+    [
+        with_speed(),
+        with_speed(type="my_msgs/Speed"),
+        with_speed(text=SPEED.text.replace("\n", "\r\n")),
+        with_speed(text=foreign.IDL_TEXT, encoding="ros2idl"),
+    ],
+    ids=["as written", "two-part name", "CRLF", "IDL"],
+)
+def test_a_type_of_another_package_is_read_by_the_definition_in_the_bag(
+    tmp_path: Path, mapping: Path, channels: list[foreign.Channel]
+) -> None:
+    report, speeds = replayed(write_bag(tmp_path / "bag", drive(), channels), mapping)
+    assert (report.steps, report.bad_messages, report.damage) == (COUNT, 0, [])
+    assert max(speeds) == pytest.approx(9.5, abs=0.01)
+
+
+def test_a_fork_of_a_standard_type_is_read_as_the_bag_has_it(tmp_path: Path, mapping: Path) -> None:
+    mapping.write_text(foreign.MAPPING.replace("field: value", "field: twist.x"))
+    channels = with_speed(type="geometry_msgs/msg/TwistStamped", text=FORKED)
+    entries = [(t, n, data[:4] + data[-8:] if n == 0 else data) for t, n, data in drive()]
+    report, speeds = replayed(write_bag(tmp_path / "bag", entries, channels), mapping)
+    assert (report.steps, report.bad_messages) == (COUNT, 0)
+    assert max(speeds) == pytest.approx(9.5, abs=0.01)
+
+
+def test_a_type_that_changed_between_two_drives_is_read_as_each_bag_has_it(tmp_path: Path, mapping: Path) -> None:
+    new = SPEED.text.replace("float64 value\n", "int32 quality\nfloat64 value\n")
+    entries = [(t, n, data[:-8] + bytes(8) + data[-8:] if n == 0 else data) for t, n, data in drive()]
+    write_bag(tmp_path / "old", drive())
+    write_bag(tmp_path / "new", entries, with_speed(text=new))
+    drives = [read_signal(tmp_path / name, load_mapping(mapping)) for name in ("old", "new", "old")]
+    assert all(found.speed_mps.max() == pytest.approx(9.5, abs=0.01) for found in drives)
+
+
+def test_a_missing_nested_definition_is_one_line_with_topic_and_type(
+    tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path / "bag", drive(), with_speed(text="other_msgs/Thing thing\nfloat64 value\n"))
+    assert main([str(bag), "--mapping", str(mapping), "--strategy", "equal"]) == BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "/car/speed: type my_msgs/msg/Speed: its definition names other_msgs/msg/Thing" in line
+    with BagReader(bag) as reader:  # the others are read
+        assert sum(message.topic != "/car/speed" for message in reader.messages()) == 2 * COUNT
+
+
+@pytest.mark.parametrize("stamp", [0, 1_234_567_890], ids=["zero", "standing"])
+def test_stamps_that_do_not_advance_are_said_once_and_log_times_are_used(
+    tmp_path: Path, mapping: Path, stamp: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path / "bag", drive(stamp=lambda _: stamp))
+    arguments = [str(bag), "--mapping", str(mapping), "--strategy", "equal"]
+    assert main(arguments) == DONE
+    out = capsys.readouterr().out
+    assert f"{COUNT} steps over {(COUNT - 1) * 0.02:.2f} s" in out
+    assert out.count("the header stamps of /car/speed, /joint_states do not advance: log times are used") == 1
+    assert main([*arguments, "--what-if", "jalalmaab_2015"]) == DONE
+    assert "nan" not in capsys.readouterr().out
+
+
+def test_a_wheel_without_a_number_is_lost_as_in_the_node_and_the_replay_drives_on(
+    tmp_path: Path, mapping: Path
+) -> None:
+    bag = write_bag(tmp_path / "bag", drive(velocity=lambda _, w: (w, foreign.NAN, w, w)))
+    report, _ = replayed(bag, mapping)
+    assert (report.steps, report.bad_messages) == (COUNT, 0)
+    assert report.notes == [f"/joint_states: front_right has no number in {COUNT} messages: lost, as in the node"]
+
+
+def test_compressed_messages_are_read_without_any_metadata(tmp_path: Path, mapping: Path) -> None:
+    entries = [(t, n, zstandard.compress(data)) for t, n, data in drive()]
+    path = write_mcap(tmp_path / "a_0.mcap", entries)
+    report, speeds = replayed(path, mapping)
+    assert (report.steps, report.bad_messages) == (COUNT, 0)
+    assert max(speeds) == pytest.approx(9.5, abs=0.01)
+
+
+def test_a_sqlite_bag_of_before_foxy_is_read(tmp_path: Path, mapping: Path) -> None:
+    mapping.write_text(foreign.MAPPING.replace("field: value", "field: twist.linear.x"))
+    channels = with_speed(type="geometry_msgs/msg/TwistStamped")
+    entries = [(t, n, data + bytes(40) if n == 0 else data) for t, n, data in drive()]
+    report, speeds = replayed(write_sqlite(tmp_path / "bag", entries, channels), mapping)
+    assert (report.steps, report.bad_messages, report.damage) == (COUNT, 0, [])
+    assert max(speeds) == pytest.approx(9.5, abs=0.01)
+
+
+def test_a_bag_that_gives_no_step_says_why_topic_by_topic(
+    tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entries = [(t, n, data[:7] if n == 2 else data) for t, n, data in drive()]
+    bag = write_bag(tmp_path / "bag", entries)
+    for more in ([], ["--what-if", "jalalmaab_2015"]):
+        assert main([str(bag), "--mapping", str(mapping), "--strategy", "equal", *more]) == BAD_INPUT
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "gave no control step: " in line
+        assert f"/joint_states: {COUNT} messages, {COUNT} of them bad" in line
+        assert f"/demand: {COUNT} messages" in line
+
+
+def test_far_fewer_steps_than_messages_are_said(tmp_path: Path, mapping: Path) -> None:
+    entries = [entry for i, entry in enumerate(drive()) if entry[1] != 2 or i < 15]
+    report, _ = replayed(write_bag(tmp_path / "bag", entries), mapping)
+    assert report.steps == 5
+    assert any(note.startswith(f"only 5 steps of {COUNT} messages") for note in report.notes)
+
+
+def test_a_car_that_stands_gives_no_zero_for_an_answer(
+    tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entries = drive(velocity=lambda _, w: (0.0 * w,) * 4)
+    entries = [(t, n, foreign.speed(t, 0.0) if n == 0 else data) for t, n, data in entries]
+    bag = write_bag(tmp_path / "bag", [(t, n, b"\0\1\0\0" + bytes(8) if n == 1 else data) for t, n, data in entries])
+    arguments = [str(bag), "--mapping", str(mapping), "--what-if", "jalalmaab_2015", "--strategy", "equal"]
+    assert main(arguments) == BAD_INPUT
+    assert "the car does not move" in capsys.readouterr().err
+
+
+def test_the_schema_of_a_copied_topic_stays_what_it_was(tmp_path: Path, mapping: Path) -> None:
+    channels = [*with_speed(text=foreign.IDL_TEXT, encoding="ros2idl"), foreign.log_channel()[0]]
+    entries = [*drive(), (foreign.START_NS + 10**12, 3, foreign.log_channel()[1])]
+    bag = write_bag(tmp_path / "bag", entries, channels)
+    out = tmp_path / "out"
+    assert main([str(bag), "--mapping", str(mapping), "--strategy", "equal", "--output", str(out)]) == DONE
+    with BagReader(out) as reader:
+        for channel in (channels[0], channels[3]):
+            topic = reader.topics[channel.topic]
+            assert (topic.encoding, topic.definition, topic.serialization) == (
+                channel.encoding,
+                channel.text,
+                channel.serialization,
+            )
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        '{"vehicle_file": "/dev/zero"}',
+        '{"vehicle_file": "/etc/passwd"}',
+        '{"vehicle_file": "../../etc/passwd"}',
+        '{"vehicle_file": "~nobody-at-all/x"}',
+        '{"vehicle_file": {"a": 1}}',
+        '{"idle_drive": "/dev/zero"}',
+        '{"critical_slip": "a lot"}',
+        '{"strategy": ["equal"]}',
+        '{"rate_hz": ' + "9" * 400 + ', "vehicle_file": "/dev/zero"}',
+    ],
+)
+def test_parameters_in_a_bag_name_no_file_and_bring_nothing_down(
+    tmp_path: Path, mapping: Path, parameters: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_bag(tmp_path / "bag", drive(5))
+    foreign.write_metadata(tmp_path / "bag", CHANNELS, custom_data={"parameters /power_manager": parameters})
+    assert main([str(tmp_path / "bag"), "--mapping", str(mapping)]) == BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("replay: ")
+
+
+@pytest.mark.parametrize(
+    "parameters", ["[" * 100_000, '{"rate_hz": 0, "friction": "x", "rule": 3, "wheel_names": [1]}', "x"]
+)
+def test_parameters_in_a_bag_that_make_no_sense_leave_the_defaults(parameters: str) -> None:
+    recorded = {"parameters /power_manager": parameters}
+    plan, default = (make_plan(Choice(strategy="equal"), custom) for custom in (recorded, {}))
+    assert plan.vehicle.hash == default.vehicle.hash
+    assert plan[2:] == default[2:]
