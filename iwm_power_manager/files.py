@@ -264,7 +264,8 @@ def to_number(text: str) -> float:
     plain = text.strip()
     if len(plain) <= MAX_NUMBER_LENGTH and (_NUMBER.fullmatch(plain) or _NOT_FINITE.fullmatch(plain)):
         return float(plain)
-    raise ValueError(f"'{plain}' is no number" + _hint(plain))
+    shown = plain if len(plain) <= MAX_NUMBER_LENGTH else f"{plain[:MAX_NUMBER_LENGTH]}..."
+    raise ValueError(f"'{shown}' is no number" + _hint(plain))
 
 
 def _hint(text: str) -> str:

@@ -8,11 +8,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from iwm_power_manager import files
+from iwm_power_manager import files, plausibility
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.gear import behind_gear
 from iwm_power_manager.model import tyre
@@ -29,7 +29,7 @@ from iwm_power_manager.model.parameters import (
     VehicleParams,
     Wheel,
 )
-from iwm_power_manager.motor_map import load_efficiency_map
+from iwm_power_manager.motor_map import MotorMap, Reach, extended, filled, fit_loss, mirrored, missing, read_map
 from iwm_power_manager.vehicle_table import ORDERED, TABLE
 
 #: 1: one section for both axles. 2: sections may stand in `front:` and `rear:`, and motors behind a gear.
@@ -49,6 +49,7 @@ class Vehicle:
     idle_drive : "none", "drag" or "enabled"
     params : the numbers for the kernels
     hash : 16 hex digits over every number the decision model reads: what a policy belongs to
+    notes : what a reader should know of how it was read, one line each; tools print them
     """
 
     name: str
@@ -56,8 +57,12 @@ class Vehicle:
     idle_drive: str
     params: VehicleParams
     hash: str
+    notes: tuple[str, ...] = ()
 
 
+#: A map may reach beyond the car's top speed by this factor; rpm in a rad/s column are 9.5 times as many.
+MAX_MAP_SPEED_RATIO = 5.0
+_MOTOR_OPTIONS = ("loss", "efficiency_map", "mirror", "extrapolate")
 _IDLE_DRAG_KEYS = {"idle_standby_w", "idle_drag_constant_nm", "idle_drag_linear_nm_per_radps"}
 _OCV_KEYS = ("ocv_soc", "ocv_cell_v")
 _LOSS_FIELDS = dict(
@@ -108,7 +113,7 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
         drive = files.check_choice("idle_drive override", "idle_drive", idle_drive, IDLE_DRIVES)
 
     chassis = _numbers(path, "chassis", "chassis", content["chassis"])
-    front, rear = _axles(path, content, chassis, drive)
+    front, rear, notes = _axles(path, content, chassis, drive)
     params = VehicleParams(
         chassis=Chassis(**chassis),
         front=front,
@@ -117,7 +122,8 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
         driver=Driver(**_numbers(path, "driver", "driver", content["driver"])),
     )
     _check_tips_over(path, params.chassis)
-    return Vehicle(content["name"].strip(), path, drive, params, _hash(params))
+    plausibility.check_car(path, params, lambda axle, part: f"{axle}.{part}" if part in content.get(axle, {}) else part)
+    return Vehicle(content["name"].strip(), path, drive, params, _hash(params), notes)
 
 
 def with_idle_drive(vehicle: Vehicle, idle_drive: str) -> Vehicle:
@@ -163,39 +169,56 @@ def _numbers(
     return numbers
 
 
-def _axles(path: Path, content: Mapping[str, Any], chassis: Mapping[str, float], drive: str) -> tuple[Axle, Axle]:
-    """Front and rear axle: each part from the axle's own section, or from the one section for both."""
-    shared = {part: _part(path, part, part, content[part], chassis, drive) for part in AXLE_PARTS if part in content}
-    axles = []
-    for axle in ("front", "rear"):
-        own = content.get(axle, {})
-        files.check_keys(path, own, (), (*AXLE_PARTS, "gear", *TABLE["axle"]), axle)
-        for part in (*AXLE_PARTS, "gear"):
-            if part in content and part in own:
-                raise ConfigError(
-                    path, f"{axle}.{part}", f"stands beside {part}, which is for both axles", "one of them"
-                )
-        for part in AXLE_PARTS:
-            if part not in content and part not in own:
-                raise ConfigError(path, f"{axle}.{part}" if {"front", "rear"} & set(content) else part, "is missing")
-        parts = shared | {
-            part: _part(path, part, f"{axle}.{part}", own[part], chassis, drive) for part in AXLE_PARTS if part in own
-        }
-        where, gear = (f"{axle}.gear", own["gear"]) if "gear" in own else ("gear", content.get("gear"))
-        if gear is not None:
-            numbers = _numbers(path, "gear", where, gear, (), chassis)
-            parts["motor"], parts["wheel"] = behind_gear(parts["motor"], parts["wheel"], **numbers)
-        track = _numbers(path, "axle", axle, {key: own[key] for key in TABLE["axle"] if key in own}, (), chassis)
-        axles.append(Axle(track_width_m=track["track_width_m"], **parts))
-    return axles[0], axles[1]
+class _Axle(NamedTuple):
+    """An axle's part of the file: where each section stands, and its content."""
+
+    sections: dict[str, tuple[str, Any]]
+    own: Mapping[str, Any]
 
 
-def _part(path: Path, part: str, where: str, mapping: Any, chassis: Mapping[str, float], drive: str) -> Any:
-    if part == "motor":
-        return _motor(path, where, mapping, drive)
-    if part == "tyre":
-        return _tyre(path, where, mapping)
-    return {"wheel": Wheel, "friction_brake": FrictionBrake}[part](**_numbers(path, part, where, mapping, (), chassis))
+def _sections(path: Path, content: Mapping[str, Any], axle: str) -> _Axle:
+    """Each part from the axle's own section, or from the one section for both."""
+    own = content.get(axle, {})
+    files.check_keys(path, own, (), (*AXLE_PARTS, "gear", *TABLE["axle"]), axle)
+    sections = {}
+    for part in (*AXLE_PARTS, "gear"):
+        if part in content and part in own:
+            raise ConfigError(path, f"{axle}.{part}", f"stands beside {part}, which is for both axles", "one of them")
+        if part in own:
+            sections[part] = f"{axle}.{part}", own[part]
+        elif part in content:
+            sections[part] = part, content[part]
+        elif part != "gear":
+            raise ConfigError(path, f"{axle}.{part}" if {"front", "rear"} & set(content) else part, "is missing")
+    return _Axle(sections, {key: own[key] for key in TABLE["axle"] if key in own})
+
+
+def _axles(
+    path: Path, content: Mapping[str, Any], chassis: Mapping[str, float], drive: str
+) -> tuple[Axle, Axle, tuple[str, ...]]:
+    """Front and rear axle, and what there is to say about their motor maps."""
+    given = {axle: _sections(path, content, axle) for axle in ("front", "rear")}
+    motors = {axle: _numbers(path, "motor", *found.sections["motor"], _MOTOR_OPTIONS) for axle, found in given.items()}
+    top_speed_mps = plausibility.top_speed_mps(chassis, 2.0 * sum(motor["max_power_w"] for motor in motors.values()))
+    axles, notes = [], []
+    for axle, found in given.items():
+        wheel = Wheel(**_numbers(path, "wheel", *found.sections["wheel"]))
+        gear = _numbers(path, "gear", *found.sections["gear"], (), chassis) if "gear" in found.sections else None
+        shaft_radps = top_speed_mps / wheel.radius_m * (gear["ratio"] if gear else 1.0)
+        motor, note = _motor(path, *found.sections["motor"], motors[axle], drive, shaft_radps, content["format"])
+        if gear:
+            motor, wheel = behind_gear(motor, wheel, **gear)
+        axles.append(
+            Axle(
+                wheel=wheel,
+                tyre=_tyre(path, *found.sections["tyre"]),
+                motor=motor,
+                friction_brake=FrictionBrake(**_numbers(path, "friction_brake", *found.sections["friction_brake"])),
+                **_numbers(path, "axle", axle, found.own, (), chassis),
+            )
+        )
+        notes += note
+    return axles[0], axles[1], tuple(dict.fromkeys(notes))
 
 
 def _tyre(path: Path, where: str, mapping: Any) -> Tyre:
@@ -210,29 +233,78 @@ def _tyre(path: Path, where: str, mapping: Any) -> Tyre:
     return tyre.make(name, values, **floor)
 
 
-def _motor(path: Path, where: str, mapping: Any, drive: str) -> Motor:
-    numbers = _numbers(path, "motor", where, mapping, ("loss", "efficiency_map"))
-    empty = np.zeros(0)
-    loss: dict[str, Any] = dict.fromkeys(_LOSS_FIELDS.values(), 0.0)
-    speed, torque, table = empty, empty, np.zeros((0, 0))
+def _motor(
+    path: Path,
+    where: str,
+    mapping: Mapping[str, Any],
+    numbers: dict[str, float],
+    drive: str,
+    top_speed_radps: float,
+    file_format: int,
+) -> tuple[Motor, list[str]]:
+    """A motor from its checked numbers and its losses; `top_speed_radps` is what its map has to reach."""
     if ("loss" in mapping) == ("efficiency_map" in mapping):
         raise ConfigError(path, where, "needs exactly one of loss, efficiency_map", "loss | efficiency_map")
+    empty = np.zeros(0)
+    loss: dict[str, Any] = dict.fromkeys(_LOSS_FIELDS.values(), 0.0)
+    table = MotorMap(empty, empty, np.zeros((0, 0)))
+    notes: list[str] = []
     if "loss" in mapping:
+        for key in ("mirror", "extrapolate"):
+            if key in mapping:
+                raise ConfigError(path, f"{where}.{key}", "is for an efficiency_map")
         given = _numbers(path, "loss", f"{where}.loss", mapping["loss"])
         loss = {_LOSS_FIELDS[key]: value for key, value in given.items()}
     else:
-        name = mapping["efficiency_map"]
-        if not isinstance(name, str):
-            raise ConfigError(path, f"{where}.efficiency_map", f"{name!r} is no file name", "path of a CSV file")
-        speed, torque, table = load_efficiency_map(path.parent / name)
-    return Motor(
+        reach = Reach(
+            peak_torque_nm=numbers["peak_torque_nm"],
+            regeneration_torque_nm=numbers["regeneration_torque_nm"],
+            max_power_w=numbers["max_power_w"],
+            top_speed_radps=top_speed_radps,
+        )
+        table, notes = _map(path, where, mapping, reach, file_format)
+    motor = Motor(
         **numbers,
         **loss,
         idle_drive=IDLE_DRIVES[drive],
-        map_speed_radps=speed,
-        map_torque_nm=torque,
-        map_loss_w=table.reshape(-1),
+        map_speed_radps=table.speed_radps,
+        map_torque_nm=table.torque_nm,
+        map_loss_w=table.loss_w.reshape(-1),
     )
+    return motor, notes
+
+
+def _map(
+    path: Path, where: str, mapping: Mapping[str, Any], reach: Reach, file_format: int
+) -> tuple[MotorMap, list[str]]:
+    """The motor's map, which covers what the motor can do, and what there is to say about it."""
+    name = mapping["efficiency_map"]
+    if not isinstance(name, str):
+        raise ConfigError(path, f"{where}.efficiency_map", f"{name!r} is no file name", "path of a CSV file")
+    mirror = files.check_bool(path, f"{where}.mirror", mapping["mirror"]) if "mirror" in mapping else None
+    source = path.parent / name
+    # Format 1 mirrors a map of driving torques unasked.
+    found = mirrored(source, read_map(source), mirror if file_format == 1 else bool(mirror))
+    if found.speed_radps[-1] > MAX_MAP_SPEED_RATIO * reach.top_speed_radps:
+        problem = (
+            f"reaches {found.speed_radps[-1]:g} rad/s, and the car's top speed is {reach.top_speed_radps:.4g} rad/s"
+        )
+        likely = "rpm in a rad/s column, or a motor's shaft without gear?"
+        allowed = f"up to {MAX_MAP_SPEED_RATIO:g} times the top speed"
+        raise ConfigError(source, "speed_rad_s", f"{problem}: {likely}", allowed)
+    lacking = missing(found, reach)
+    notes = []
+    if lacking and "extrapolate" in mapping:
+        files.check_choice(path, f"{where}.extrapolate", mapping["extrapolate"], ("loss_model",))
+        fit = fit_loss(found)
+        found = extended(found, reach, fit)
+        notes.append(
+            f"{source.name}: {'; '.join(lacking)} taken from the loss model {fit}, which meets the map's efficiencies "
+            f"to {fit.rms_error:.3f} rms, {fit.worst_error:.3f} at most"
+        )
+    elif lacking:
+        raise ConfigError(source, "", f"lacks {'; '.join(lacking)}", "all of it, or extrapolate: loss_model")
+    return filled(found), notes
 
 
 def _battery(path: Path, mapping: Any) -> Battery:

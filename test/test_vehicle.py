@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ import pytest
 from iwm_power_manager import files, vehicle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.motor import electrical_power_w, enabled_loss_w, idle_drag_nm
-from iwm_power_manager.motor_map import load_efficiency_map
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle, with_idle_drive, with_params
 from oracles.step import loss_w
@@ -313,6 +311,8 @@ def test_a_motor_behind_a_gear_is_what_the_wheel_sees(loaded):
 @pytest.mark.parametrize("content", [CONTENT, files.read_yaml(FOLDER / "jalalmaab_2015_map.yaml")], ids=["loss", "map"])
 def test_a_gear_takes_its_part_of_the_power_in_the_direction_it_flows(torque, content, loaded):
     ratio, efficiency, speed = 4.0, 0.95, 40.0
+    if "efficiency_map" in content["motor"]:
+        content = {**content, "motor": {**content["motor"], "mirror": True, "extrapolate": "loss_model"}}
     plain = loaded({**content, "format": 2}).params.front.motor
     geared = loaded({**content, "format": 2, "gear": {"ratio": ratio, "efficiency": efficiency}}).params.front.motor
     at_wheel = torque * ratio * (efficiency if torque > 0.0 else 1.0 / efficiency)
@@ -430,113 +430,62 @@ def test_between_its_points_the_map_is_close_to_the_coefficients():
             assert ours == pytest.approx(theirs, rel=0.03)
 
 
-def write(folder: Path, *rows: str, header: str = "speed_rad_s,torque_nm,efficiency") -> Path:
-    path = folder / "map.csv"
-    path.write_text("\n".join((header, *rows)) + "\n")
-    return path
-
-
-def test_a_map_of_both_signs_is_taken_as_it_is(tmp_path):
-    path = write(tmp_path, "10,-20,0.5", "10,20,0.8", "50,-20,0.7", "50,20,0.9")
-    speed, torque, loss = load_efficiency_map(path)
-    assert (speed.tolist(), torque.tolist()) == ([10.0, 50.0], [-20.0, 20.0])
-    # 200 W mechanical: half of it is lost; 200 / 0.8 - 200 W; and so on.
-    assert loss == pytest.approx(np.array([[100.0, 50.0], [300.0, 1000.0 / 0.9 - 1000.0]]))
-
-
-def test_a_map_without_negative_torque_is_mirrored(tmp_path):
-    path = write(tmp_path, "10,20,0.8", "10,40,0.5", "50,20,0.9", "50,40,0.9")
-    _, torque, loss = load_efficiency_map(path)
-    assert torque.tolist() == [-40.0, -20.0, 20.0, 40.0]
-    assert np.array_equal(loss, loss[:, ::-1])
-
-
-def test_at_zero_speed_or_torque_the_loss_is_continued_from_the_neighbours(tmp_path):
-    path = write(tmp_path, *(f"{w},{t},{0 if w * t == 0 else 0.8}" for w in (0, 10, 20) for t in (-20, 0, 40)))
-    _, _, loss = load_efficiency_map(path)
-    # Braking loses 0.2 * 200 W, driving 400 W / 0.8 - 400 W; torque 0 lies a third of the way.
-    assert loss[1] == pytest.approx([40.0, 40.0 + (100.0 - 40.0) / 3.0, 100.0])
-    assert loss[0] == pytest.approx(loss[1])
-
-
-def test_spaces_blank_lines_and_the_order_of_rows_do_not_matter(tmp_path):
-    rows = ("10,20,0.8", "10,40,0.5", "50,20,0.9", "50,40,0.85")
-    tidy = load_efficiency_map(write(tmp_path, *rows))
-    messy = load_efficiency_map(
-        write(
-            tmp_path,
-            rows[3],
-            "",
-            f" {rows[0]} ".replace(",", " , "),
-            rows[2],
-            rows[1],
-            header="speed_rad_s, torque_nm ,efficiency",
-        )
-    )
-    assert all(np.array_equal(a, b) for a, b in zip(tidy, messy, strict=True))
-
-
-GOOD = ("10,20,0.8", "10,40,0.5", "50,20,0.9", "50,40,0.85")
-
-
-@pytest.mark.parametrize(
-    ("rows", "words"),
-    [
-        ((*GOOD, "60,20"), "line 6: has 2 values; allowed: 3"),
-        ((*GOOD, "60,20,0.5,1"), "line 6: has 4 values; allowed: 3"),
-        ((*GOOD, "fast,20,0.5"), "line 6, speed_rad_s: 'fast' is no number; allowed: 0 to 2000"),
-        ((*GOOD, "60,,0.5"), "line 6, torque_nm: '' is no number; allowed: -20000 to 20000"),
-        ((*GOOD, "60,20,nan"), "line 6, efficiency: nan is not finite; allowed: 0 to 1"),
-        ((*GOOD, "inf,20,0.5"), "line 6, speed_rad_s: inf is not finite; allowed: 0 to 2000"),
-        ((*GOOD, "-1,20,0.5"), "line 6, speed_rad_s: -1.0 is out of range; allowed: 0 to 2000"),
-        ((*GOOD, "2001,20,0.5"), "line 6, speed_rad_s: 2001.0 is out of range; allowed: 0 to 2000"),
-        ((*GOOD, "60,30000,0.5"), "line 6, torque_nm: 30000.0 is out of range; allowed: -20000 to 20000"),
-        ((*GOOD, "60,20,85"), "line 6, efficiency: 85.0 is out of range; allowed: 0 to 1"),
-        ((*GOOD, "60,20,-0.1"), "line 6, efficiency: -0.1 is out of range; allowed: 0 to 1"),
-        ((*GOOD, "60,20,0"), "line 6: efficiency 0 means an infinite loss; allowed: above 0, up to 1"),
-        ((*GOOD, "50,40,0.85"), "line 6: repeats speed 50, torque 40"),
-        ((*GOOD, "60,20,0.5"), "map.csv: lacks the point speed 60, torque 40; allowed: a full grid"),
-        (GOOD[:2], "has 1 speeds and 2 torques; allowed: 2 or more of each"),
-        (GOOD[::2], "has 2 speeds and 1 torques; allowed: 2 or more of each"),
-        ((), "has 0 speeds and 0 torques; allowed: 2 or more of each"),
-        (("0,0,0", "0,20,0", "10,0,0", "10,-20,0.5", "0,-20,0"), "lacks the point speed 10, torque 20"),
-        (("0,0,0", "0,20,0", "0,-20,0", "0,40,0"), "has 1 speeds"),
-    ],
-)
-def test_a_bad_row_is_named(tmp_path, rows, words):
-    with pytest.raises(ConfigError) as caught:
-        load_efficiency_map(write(tmp_path, *rows))
-    assert words in str(caught.value)
-
-
-@pytest.mark.parametrize("header", ["", "speed,torque,efficiency", "torque_nm,speed_rad_s,efficiency"])
-def test_a_wrong_header_is_named(tmp_path, header):
-    with pytest.raises(
-        ConfigError, match=r"map\.csv: line 1: .* is no header; allowed: speed_rad_s,torque_nm,efficiency"
-    ):
-        load_efficiency_map(write(tmp_path, *GOOD, header=header))
-
-
-def test_an_empty_or_absent_file_is_named(tmp_path):
-    path = tmp_path / "map.csv"
-    with pytest.raises(ConfigError, match=r"map\.csv: cannot be read"):
-        load_efficiency_map(path)
-    path.write_text("")
-    with pytest.raises(ConfigError, match=r"map\.csv: line 1: '' is no header"):
-        load_efficiency_map(path)
-
-
 def test_a_map_s_path_is_seen_from_the_vehicle_file(tmp_path):
     (tmp_path / "cars").mkdir()
-    write(tmp_path, *GOOD)
+    (tmp_path / "map.csv").write_text(MAP.read_text())
     text = (FOLDER / "jalalmaab_2015_map.yaml").read_text().replace("../motors/siemens_pm_7500w.csv", "../map.csv")
     (tmp_path / "cars" / "car.yaml").write_text(text)
-    assert load_vehicle(tmp_path / "cars" / "car.yaml").params.front.motor.map_torque_nm.tolist() == [
-        -40.0,
-        -20.0,
-        20.0,
-        40.0,
-    ]
+    assert load_vehicle(tmp_path / "cars" / "car.yaml").params.front.motor.map_torque_nm[-1] == 200.0
     (tmp_path / "map.csv").unlink()
     with pytest.raises(ConfigError, match=r"map\.csv: cannot be read"):
         load_vehicle(tmp_path / "cars" / "car.yaml")
+
+
+# --- Numbers that do not fit each other ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "key", "words"),
+    [
+        (("motor", "max_power_w"), 15, "motor.max_power_w", "means 0.0187 W per kg of car and motor: kW in a W field?"),
+        (("motor", "max_power_w"), 7.5, "motor.max_power_w", "kW in a W field?"),
+        (
+            ("motor", "peak_torque_nm"),
+            20000.0,
+            "motor.peak_torque_nm",
+            "means 0.124 m/s at which peak torque takes all",
+        ),
+        (("battery", "discharge_limit_w"), 47.5, "battery.discharge_limit_w", "kW in a W field?"),
+        (("battery", "charge_limit_w"), 47.5, "battery.charge_limit_w", "kW in a W field?"),
+        (("battery", "resistance_ohm"), 6.3, "battery.resistance_ohm", "milliohm in an ohm field"),
+        (("battery", "ohmic_resistance_ohm"), 4.15, "battery.ohmic_resistance_ohm", "milliohm in an ohm field"),
+        (("battery", "capacity_ah"), 9000.0, "battery.capacity_ah", "Wh or mAh in an Ah field?"),
+        (("motor", "loss", "quadratic_torque_w_per_nm2"), 68.5, "motor.loss", "losses of all motors"),
+    ],
+)
+def test_numbers_that_do_not_fit_each_other_are_refused_with_the_likely_unit(path, value, key, words, refused):
+    error = refused(changed(path, value))
+    assert error.key == key
+    assert words in error.problem
+
+
+def test_a_torque_of_the_motor_s_shaft_without_a_gear_is_noticed(refused):
+    content = changed(("motor", "continuous_torque_nm"), 5.0, content=changed(("motor", "peak_torque_nm"), 20.0))
+    assert "a torque at the motor's shaft without gear?" in refused(content).problem
+
+
+def test_the_axle_at_fault_is_named(refused):
+    weak = {**CONTENT["motor"], "max_power_w": 7.5}
+    assert refused(per_axle(rear={"motor": weak})).key == "rear.motor.max_power_w"
+
+
+def test_losses_in_kilowatts_are_noticed(refused):
+    loss = {key: value / 1000.0 for key, value in CONTENT["motor"]["loss"].items()}
+    error = refused(changed(("motor", "loss"), loss))
+    assert (error.key, "kW in a W field?" in error.problem) == ("motor.loss", True)
+
+
+@pytest.mark.parametrize("charge", [0.0, 10e3])
+def test_a_battery_may_be_small_or_take_nothing(charge, loaded):
+    content = changed(("battery", "discharge_limit_w"), 8e3, content=changed(("battery", "charge_limit_w"), charge))
+    assert loaded(content).params.battery.charge_limit_w == charge
