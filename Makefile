@@ -21,7 +21,7 @@ test: lint type  ## Linters, types and all tests
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 ##@ Results
-.PHONY: policies study bench
+.PHONY: policies study roads bench
 CYCLES := $(foreach cycle,ftp75 hwfet nycc,--cycle config/cycles/$(cycle).csv)
 policies: setup-run  ## Solve the shipped policies again (the same tables come out)
 	@for idle in drag none; do $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml --idle-drive $$idle \
@@ -29,6 +29,9 @@ policies: setup-run  ## Solve the shipped policies again (the same tables come o
 
 study: setup-run  ## All tables and figures of the paper, and what beats them
 	@$(BIN)/evaluate --study runs/study $(ARGS)
+
+roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required
+	@$(BIN)/python -m iwm_sim.tools.roads --page docs/roads.md $(ARGS)
 
 bench: setup-dev  ## Time control path, bags and closed loop on this machine, each beside a peer
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit $$?; done

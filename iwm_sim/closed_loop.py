@@ -47,7 +47,7 @@ class Row(NamedTuple):
     """One step of a run, taken at its start; torques, power and acceleration are what the plant did in that step.
 
     Wheel speeds, torques, slips and heat are those of the left wheel of each axle: on a straight, uniform road left and
-    right are alike. Roads where they are not have `iwm_sim.drive.RoadRow` beside it.
+    right are alike. Drives where they are not have a `RoadRow` beside it.
     """
 
     time_s: float
@@ -84,6 +84,48 @@ class Row(NamedTuple):
 COLUMNS = Row._fields
 
 
+class RoadRow(NamedTuple):
+    """What a step of a drive has beside `Row`: each wheel, and the car in the plane; taken at its start.
+
+    Torques are what motors and brakes really did in the step, forward positive; slips are eq. 10 in the direction of
+    travel, braking negative.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    lateral_speed_mps: float
+    yaw_rate_radps: float
+    lateral_acceleration_mps2: float
+    steering_wheel_rad: float
+    grade: float
+    wheel_fl_radps: float
+    wheel_fr_radps: float
+    wheel_rl_radps: float
+    wheel_rr_radps: float
+    slip_fl: float
+    slip_fr: float
+    slip_rl: float
+    slip_rr: float
+    motor_fl_nm: float
+    motor_fr_nm: float
+    motor_rl_nm: float
+    motor_rr_nm: float
+    friction_fl_nm: float
+    friction_fr_nm: float
+    friction_rl_nm: float
+    friction_rr_nm: float
+    road_fl: float
+    road_fr: float
+    road_rl: float
+    road_rr: float
+    mode: float
+    wheels_lost: float
+
+
+ROAD_COLUMNS = RoadRow._fields
+
+
 class Noise(NamedTuple):
     """Errors of sensors and foot, added to each sample; empty arrays mean none.
 
@@ -104,11 +146,19 @@ NO_NOISE = Noise()
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A finished run: `series` is (steps, len(COLUMNS)); `final` the plant at its end."""
+    """A finished run.
+
+    Attributes
+    ----------
+    series : float64[steps, len(COLUMNS)]
+    final : the plant at its end
+    road : float64[steps, len(ROAD_COLUMNS)], of a `drive.Drive`: each wheel, and the car in the plane
+    """
 
     dt_s: float
     series: FloatArray
     final: plant.PlantState
+    road: FloatArray | None = None
 
     def __getitem__(self, column: str) -> FloatArray:
         return self.series[:, COLUMNS.index(column)]

@@ -7,13 +7,14 @@ it sends a set of inputs, waits for the commands with that stamp, steps, and sen
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import gc
 import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, cast
 
@@ -32,7 +33,7 @@ from std_msgs.msg import Bool
 
 from iwm_power_manager.control.types import Wheels
 from iwm_power_manager.cycle import load_cycle
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.ros import ending, qos
 from iwm_power_manager.ros import messages as m
@@ -44,6 +45,7 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.drive import Drive, save_run
 from iwm_sim.pacing import FRICTION, MOTOR, Exchange, NoAnswerError, Pacer
+from iwm_sim.scenario import Scenario, load_scenario, on_cycle
 
 RECORDER_READY = "recorder/ready"
 _NO_TORQUE: Wheels = (0.0, 0.0, 0.0, 0.0)
@@ -62,6 +64,11 @@ PARAMETERS = (
     _spec("vehicle_file", "config/vehicles/jalalmaab_2015.yaml", "Vehicle file of the car that is driven."),
     _spec("idle_drive", "", "Replaces the vehicle's idle_drive; empty: as in its file.", choices=("", *IDLE_DRIVES)),
     _spec("cycle_file", "config/cycles/nycc.csv", "Drive cycle, a CSV file with time_s,speed_mps[,grade]."),
+    _spec(
+        "scenario_file",
+        "",
+        "Scenario: file, or name of one of config/scenarios; it replaces vehicle, cycle, friction and charge.",
+    ),
     _spec("until_s", 0.0, "End after this much of the cycle, s; 0: at its end.", 0.0, 1e6),
     _spec("friction", 0.9, "Peak friction coefficient of the road.", 0.05, 1.5),
     _spec("initial_soc", 0.8, "State of charge at the start, 0..1.", 0.0, 1.0),
@@ -90,6 +97,24 @@ PARAMETERS = (
     _spec("result_file", "", "Time series of the drive, an .npz; empty: none."),
     _spec("progress", False, "Write lines 'progress <simulated s> <whole s>' to standard output."),
 )
+
+
+def _scenario(values: Mapping[str, Any]) -> Scenario:
+    """What is driven, by the parameters: a scenario's file, or a cycle on a uniform road."""
+    idle_drive = values["idle_drive"] or None
+    until_s = values["until_s"] or math.inf
+    if values["scenario_file"]:
+        scenario = load_scenario(values["scenario_file"], idle_drive)
+        if values["lockstep"] and any(fault.message for fault in scenario.faults):
+            raise ConfigError(scenario.path, "faults", "lose messages, and lock-step waits for each", "lockstep: false")
+        return dataclasses.replace(scenario, duration_s=min(scenario.duration_s, until_s))
+    return on_cycle(
+        load_vehicle(resolve(values["vehicle_file"]), idle_drive),
+        load_cycle(resolve(values["cycle_file"])),
+        values["friction"],
+        values["initial_soc"],
+        until_s,
+    )
 
 
 class _Phase(enum.Enum):
@@ -123,14 +148,7 @@ class Simulator(Node):
         speed_factor: float = values["speed_factor"]
         self._period_ns = round(1e9 / values["rate_hz"])
         period_s = self._period_ns / 1e9
-        self._drive = Drive(
-            load_vehicle(resolve(values["vehicle_file"]), values["idle_drive"] or None),
-            load_cycle(resolve(values["cycle_file"])),
-            friction=values["friction"],
-            initial_soc=values["initial_soc"],
-            dt_s=period_s,
-            until_s=values["until_s"] or math.inf,
-        )
+        self._drive = Drive(_scenario(values), dt_s=period_s)
         self._pedal_steps = max(1, round(values["rate_hz"] / values["pedal_rate_hz"]))
         self._exchange = Exchange(values["resend_after_s"], values["answer_timeout_s"])
         self._pacer = Pacer(period_s, speed_factor)
@@ -338,6 +356,8 @@ class Simulator(Node):
         self._publish(m.POWER_DEMAND, m.number_message(sensors.power_demand_w))
 
     def _publish(self, topic: str, message: Any) -> None:
+        if self._drive.lost(topic):
+            return
         self._outputs[topic].publish(message)
         self._published[topic] += 1
 

@@ -23,6 +23,7 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import simulator
 from iwm_sim.drive import Drive, load_run
+from iwm_sim.scenario import on_cycle
 from iwm_sim.simulator import PARAMETERS
 
 MODULE = "iwm_sim.simulator"
@@ -39,7 +40,7 @@ STAMPED = {
 def compiled_drive(hill: Path) -> None:
     """Compile the drive once, before processes are started that have to answer in time."""
     vehicle = load_vehicle(resolve("config/vehicles/jalalmaab_2015.yaml"))
-    Drive(vehicle, load_cycle(hill), friction=0.9, initial_soc=0.8, dt_s=0.02)
+    Drive(on_cycle(vehicle, load_cycle(hill), 0.9), dt_s=0.02)
 
 
 @pytest.fixture(scope="module")

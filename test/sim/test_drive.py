@@ -13,6 +13,7 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import closed_loop
 from iwm_sim.drive import CAR_COLUMNS, LAW_COLUMNS, Drive, load_run, save_run
+from iwm_sim.scenario import on_cycle
 
 DT = 0.01
 NO_ERROR = (0.0, 0.0, 0.0, 0.0)
@@ -38,7 +39,7 @@ def cycle():
 @pytest.fixture(scope="module")
 def driven(vehicle, cycle):
     """A drive with the law stepped outside of it, as over DDS, to the middle of NYCC's first hills."""
-    drive = Drive(vehicle, cycle, friction=0.9, initial_soc=0.8, dt_s=DT, until_s=75.0)
+    drive = Drive(on_cycle(vehicle, cycle, 0.9, until_s=75.0), dt_s=DT)
     state, settings, policy = initial_state(), default_settings("equal"), empty_table()
     while not drive.finished:
         demand = drive.sense().power_demand_w
@@ -63,32 +64,32 @@ def test_what_only_the_law_knows_stays_empty(driven):
 
 
 def test_sensing_twice_changes_nothing(vehicle, cycle):
-    drive = Drive(vehicle, cycle, friction=0.9, initial_soc=0.8, dt_s=DT)
+    drive = Drive(on_cycle(vehicle, cycle, 0.9), dt_s=DT)
     assert drive.sense() == drive.sense()
     assert drive.step == 0
 
 
 def test_warming_up_leaves_the_drive_at_its_start(vehicle, cycle):
-    drive = Drive(vehicle, cycle, friction=0.9, initial_soc=0.8, dt_s=DT)
+    drive = Drive(on_cycle(vehicle, cycle, 0.9), dt_s=DT)
     assert drive.car == closed_loop.plant.initial_plant(vehicle.params, 0.8, 0.0)
     assert len(drive.run().series) == 0
 
 
 def test_it_ends_with_the_cycle_or_before(vehicle, cycle):
-    assert Drive(vehicle, cycle, friction=0.9, initial_soc=0.8, dt_s=DT).duration_s == pytest.approx(598.0)
-    assert Drive(vehicle, cycle, friction=0.9, initial_soc=0.8, dt_s=DT, until_s=1.0).duration_s == pytest.approx(1.0)
-    assert Drive(vehicle, cycle, friction=0.9, initial_soc=0.8, dt_s=DT, until_s=1e6).duration_s == pytest.approx(598.0)
+    assert Drive(on_cycle(vehicle, cycle, 0.9), dt_s=DT).duration_s == pytest.approx(598.0)
+    assert Drive(on_cycle(vehicle, cycle, 0.9, until_s=1.0), dt_s=DT).duration_s == pytest.approx(1.0)
+    assert Drive(on_cycle(vehicle, cycle, 0.9, until_s=1e6), dt_s=DT).duration_s == pytest.approx(598.0)
 
 
 def test_a_cycle_shorter_than_a_step_is_refused_by_name(vehicle):
     blink = make_cycle("blink", [0.0, 0.001], [0.0, 0.0])
     with pytest.raises(ConfigError, match=r"^blink: time_s: lasts no step of 0\.01 s; allowed: >= 0\.01 s"):
-        Drive(vehicle, blink, friction=0.9, initial_soc=0.8, dt_s=DT)
+        Drive(on_cycle(vehicle, blink, 0.9), dt_s=DT)
 
 
 def test_the_pedal_alone_brakes_with_the_force_the_demand_stands_for(vehicle):
     braking = make_cycle("braking", [0.0, 1.0, 9.0], [20.0, 20.0, 0.0])
-    drive = Drive(vehicle, braking, friction=0.9, initial_soc=0.8, dt_s=DT)
+    drive = Drive(on_cycle(vehicle, braking, 0.9), dt_s=DT)
     while drive.sense().brake == 0.0:
         drive.advance(NO_ERROR, NO_ERROR)
     sensors = drive.sense()
@@ -100,7 +101,7 @@ def test_the_pedal_alone_brakes_with_the_force_the_demand_stands_for(vehicle):
 
 def test_a_car_without_commands_stops_by_its_brakes_alone(vehicle):
     braking = make_cycle("braking", [0.0, 1.0, 9.0, 20.0], [20.0, 20.0, 0.0, 0.0])
-    drive = Drive(vehicle, braking, friction=0.9, initial_soc=0.8, dt_s=DT)
+    drive = Drive(on_cycle(vehicle, braking, 0.9), dt_s=DT)
     while not drive.finished:
         drive.advance(NO_ERROR, drive.pedal_brake_torque_nm())
     assert drive.car.speed_mps < 0.05
@@ -113,6 +114,7 @@ def test_a_run_comes_back_from_its_file_as_it_was(tmp_path, driven):
     again, notes = load_run(tmp_path / "run.npz")
     assert notes == {"resent": 2}
     np.testing.assert_array_equal(again.series, run.series)
+    np.testing.assert_array_equal(again.road, run.road)
     assert again.final == run.final
     assert again.dt_s == run.dt_s
 

@@ -1,0 +1,60 @@
+"""What `roads` says of scenarios: lines for the terminal, and the page of all of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from iwm_sim.road_measures import MEASURES, OF_HEALTHY
+from iwm_sim.road_run import Checked, RoadResult
+
+
+def _number(value: float) -> str:
+    return "never" if value == math.inf else f"{value:.3g}" if abs(value) < 10.0 else f"{value:.1f}"
+
+
+def _bound(check: Checked) -> str:
+    low, high = check.bound.at_least, check.bound.at_most
+    parts = [f"≥ {low:g}"] if low > -math.inf else []
+    return " and ".join(parts + ([f"≤ {high:g}"] if high < math.inf else []))
+
+
+def text(result: RoadResult) -> str:
+    """A scenario in lines: its name and verdict, and each requirement."""
+    lines = [f"{'pass' if result.passed else 'FAIL'}  {result.scenario.name}: {result.scenario.about}"]
+    for check in result.checked:
+        mark = " " if check.holds else "!"
+        lines.append(f"    {mark} {check.bound.measure:<30} {_number(check.value):>8}   required {_bound(check)}")
+    return "\n".join(lines)
+
+
+_HEAD = """\
+# Real roads
+
+Written by `make roads`: each scenario of `config/scenarios/` driven with strategy `{strategy}`, the power manager as
+the node runs it, at 100 Hz, on the double-track plant. {passed} of {all} scenarios meet all that they require. What a
+measure means stands [below](#measures). The plant, the driver and their numbers are models: nothing here was measured
+in a car.
+
+| scenario | what happens | measure | value | required | |
+|---|---|---|---|---|---|
+"""
+
+
+def page(results: Sequence[RoadResult], strategy: str) -> str:
+    """The page, in Markdown."""
+    passed = sum(result.passed for result in results)
+    lines = [_HEAD.format(strategy=strategy, passed=passed, all=len(results))]
+    for result in results:
+        first = f"| `{result.scenario.name}` | {result.scenario.about} "
+        for check in result.checked:
+            verdict = "pass" if check.holds else "**fail**"
+            told = f"`{check.bound.measure}` | {_number(check.value)} | {_bound(check)} | {verdict} |\n"
+            lines.append(f"{first}| {told}")
+            first = "| | "
+    lines.append("\n## Measures\n\n")
+    for name, measure in MEASURES.items():
+        lines.append(f"- `{name}`: {' '.join((measure.__doc__ or '').split())}\n")
+    for name, measure in OF_HEALTHY.items():
+        lines.append(f"- `{name}`: `{measure.__name__}` over that of the same scenario without its faults.\n")
+    return "".join(lines)

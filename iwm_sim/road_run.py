@@ -1,0 +1,137 @@
+"""A scenario driven with the power manager in one process: what `make roads`, `evaluate` and the tests call.
+
+The power manager is `control.controller.Controller` as the node runs it in real time: its inputs are checked, aged and
+supervised; only DDS and the clock are missing. It has been running for a while when a scenario begins, so that its
+motors are released.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from iwm_power_manager.control.controller import Controller, ControllerLimits
+from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
+from iwm_power_manager.control.settings import Settings, default_settings
+from iwm_power_manager.control.thresholds import Thresholds, input_limits, supervision_limits
+from iwm_power_manager.replay.plan import PolicyBank
+from iwm_power_manager.vehicle import Vehicle
+from iwm_sim.closed_loop import BATTERY_TEMPERATURE_DEGC, Run, decision_of
+from iwm_sim.drive import Drive, Sensors
+from iwm_sim.faults import WHEELS
+from iwm_sim.road_measures import OF_HEALTHY, driven, measured
+from iwm_sim.scenario import Bound, Scenario
+
+#: The power manager is given the start of the scenario for this long before the car is let go, s.
+SETTLE_S = 1.5
+#: Ages at which speed, wheels, demand and battery are missing: three periods of 100 Hz, of 10 Hz for the battery.
+AGES_S = (0.03, 0.03, 0.03, 0.3)
+_NS_PER_S = 1_000_000_000
+
+
+class Checked(NamedTuple):
+    """One requirement of a scenario and what was measured."""
+
+    bound: Bound
+    value: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the requirement is met; a value that is not a number meets none."""
+        return self.bound.at_least <= self.value <= self.bound.at_most
+
+
+class RoadResult(NamedTuple):
+    """A scenario that was driven."""
+
+    scenario: Scenario
+    run: Run
+    checked: tuple[Checked, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether all requirements are met."""
+        return all(check.holds for check in self.checked)
+
+
+def controller_of(scenario: Scenario, settings: Settings | None = None, policies: str = "policies") -> Controller:
+    """The power manager as the node starts it, for the scenario's car and the friction it is told."""
+    vehicle: Vehicle = scenario.vehicle
+    params = vehicle.params
+    thresholds = Thresholds()
+    settings = settings or default_settings()
+    limits = ControllerLimits(
+        inputs=input_limits(thresholds, params.front.wheel.radius_m, by_clock=True),
+        age_s=AGES_S,
+        supervision=supervision_limits(thresholds),
+    )
+    table = PolicyBank(policies, (0.0, 0.5, 0.0, 0.5), vehicle).table(settings.strategy, scenario.told_friction)
+    return Controller(params, WHEELS, limits, settings, table, scenario.told_friction)
+
+
+def give(controller: Controller, sensors: Sensors, drive: Drive, now_ns: int) -> None:
+    """Hand the power manager everything that arrives in this step."""
+    monitor = controller.monitor
+    if not drive.lost("vehicle_speed") and not math.isnan(sensors.speed_mps):
+        monitor.take_speed(SpeedReading(now_ns, sensors.speed_mps), now_ns)
+    if not drive.lost("wheel_states"):
+        monitor.take_wheels(JointReading(now_ns, WHEELS, sensors.wheel_speed_radps), now_ns)
+    if not drive.lost("battery_state"):
+        battery = BatteryReading(
+            now_ns,
+            float(np.float32(sensors.soc)),
+            BATTERY_TEMPERATURE_DEGC,
+            sensors.battery_voltage_v,
+            sensors.battery_current_a,
+        )
+        monitor.take_battery(battery, now_ns)
+    if not drive.lost("power_demand"):
+        monitor.take_demand(sensors.power_demand_w, 0.0, now_ns)
+
+
+def drive_scenario(
+    scenario: Scenario, controller: Controller | None = None, *, dt_s: float = 0.01, substeps: int = 2
+) -> Run:
+    """Drive a scenario to its end.
+
+    Parameters
+    ----------
+    controller : the power manager; None: as the node starts it
+    dt_s, substeps : control step, and plant steps in each
+    """
+    manager = controller or controller_of(scenario)
+    drive = Drive(scenario, dt_s=dt_s, substeps=substeps)
+    period_ns = round(dt_s * _NS_PER_S)
+    now_ns = _NS_PER_S
+    start = drive.sense()._replace(power_demand_w=0.0, accelerator=0.0, brake=0.0)
+    for _ in range(round(SETTLE_S / dt_s)):
+        give(manager, start, drive, now_ns)
+        manager.step(now_ns, dt_s)
+        now_ns += period_ns
+    while not drive.finished:
+        give(manager, drive.sense(), drive, now_ns)
+        command = manager.step(now_ns, dt_s).command
+        drive.advance(
+            command.motor_torque_nm,
+            command.friction_torque_nm,
+            decision_of(command),
+            float(manager.supervision.mode),
+            float(manager.wheels_lost),
+        )
+        now_ns += period_ns
+    return drive.run()
+
+
+def check_scenario(scenario: Scenario, settings: Settings | None = None) -> RoadResult:
+    """Drive a scenario and compare what comes out with what it requires."""
+    run = drive_scenario(scenario, controller_of(scenario, settings))
+    names = [bound.measure for bound in scenario.require]
+    healthy = None
+    if not OF_HEALTHY.keys().isdisjoint(names):
+        whole = dataclasses.replace(scenario, faults=())
+        healthy = driven(drive_scenario(whole, controller_of(whole, settings)), scenario.truth)
+    values = measured(names, driven(run, scenario.truth), healthy)
+    return RoadResult(scenario, run, tuple(Checked(bound, values[bound.measure]) for bound in scenario.require))

@@ -1,0 +1,65 @@
+"""Drive the scenarios of real roads and say what came out: `roads --help`.
+
+Exit codes: 0 every requirement is met; 1 one is not; 2 bad arguments or files; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from iwm_power_manager.control.settings import default_settings
+from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
+from iwm_power_manager.errors import IwmError
+from iwm_power_manager.files import atomic_write
+from iwm_power_manager.share import share_path
+from iwm_sim.road_report import page, text
+from iwm_sim.road_run import RoadResult, check_scenario
+from iwm_sim.scenario import FOLDER, load_scenario
+
+DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+
+def parser() -> argparse.ArgumentParser:
+    """Arguments of the command."""
+    result = argparse.ArgumentParser(
+        prog="roads", description="Drive scenarios of real roads with the power manager and check what they require."
+    )
+    result.add_argument("scenario", nargs="*", help="files, or names of config/scenarios (default: all of them)")
+    result.add_argument("--strategy", choices=list(drivable()), default=DEFAULT_STRATEGY, help="(default: %(default)s)")
+    result.add_argument("--page", type=Path, metavar="MD", help="write the table as a page")
+    result.add_argument("--json", type=Path, metavar="FILE", help="write the values as JSON")
+    return result
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Drive and report; returns the exit code."""
+    options = parser().parse_args(argv)
+    try:
+        names = options.scenario or sorted(str(path) for path in share_path(FOLDER).glob("*.yaml"))
+        scenarios = [load_scenario(name) for name in names]
+        settings = default_settings(options.strategy)
+        results: list[RoadResult] = []
+        for scenario in scenarios:
+            results.append(check_scenario(scenario, settings))
+            print(text(results[-1]), flush=True)
+        failed = [result.scenario.name for result in results if not result.passed]
+        print(f"{len(results) - len(failed)} of {len(results)} scenarios meet all they require")
+        if options.page:
+            atomic_write(options.page, page(results, options.strategy).encode())
+        if options.json:
+            values = {r.scenario.name: {c.bound.measure: c.value for c in r.checked} for r in results}
+            atomic_write(options.json, (json.dumps(values, indent=2) + "\n").encode())
+    except IwmError as error:
+        print(f"roads: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    return FAILED if failed else DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())
