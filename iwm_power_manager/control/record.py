@@ -51,11 +51,12 @@ _COMMAND = (
     Signal("rear_power_w", "power of the rear axle's command"),
     Signal("front_slip", "filtered slip of the front axle"),
     Signal("rear_slip", "filtered slip of the rear axle"),
+    Signal("gated_wheels", "bits of the wheels held at zero torque: 1, 2, 4, 8 in the order of the wheels"),
 )
 _CONTROLLER = (
     Signal("step", "steps since the law's initial state; 0 is the first"),
-    Signal("front_heat", "heat index of the front motors, 0 cold to 1 hot"),
-    Signal("rear_heat", "heat index of the rear motors, 0 cold to 1 hot"),
+    Signal("front_heat", "heat index of the hotter front motor, 0 cold to 1 hot"),
+    Signal("rear_heat", "heat index of the hotter rear motor, 0 cold to 1 hot"),
 )
 _SUPERVISION = (
     Signal("mode", "0 waiting, 1 normal, 2 degraded, 3 recovering"),
@@ -106,17 +107,32 @@ def to_numbers(
         measurement.speed_mps,
         *measurement.wheel_speed_radps,
         *measurement[2:],
-        *command.motor_torque_nm,
-        *command.friction_torque_nm,
-        *command[2:],
-        before.steps,
-        after.front_heat,
-        after.rear_heat,
+        *decided(command, before, after),
         *supervision[:4],
         watch.wheels_lost,
         watch.requested_power_w,
         *watch.age_s,
         *settings,
+    ]
+
+
+#: What a record that is older than a signal would have said.
+YOUNGER_SIGNALS = {"gated_wheels": 0.0}
+
+#: The signals the law decides.
+DECIDED_NAMES = tuple(signal.name for signal in (*_COMMAND, *_CONTROLLER))
+
+
+def decided(command: Command, before: ControllerState, after: ControllerState) -> list[float]:
+    """Values of `DECIDED_NAMES`."""
+    heat = [wheel.heat for wheel in after.wheels]
+    return [
+        *command.motor_torque_nm,
+        *command.friction_torque_nm,
+        *command[2:],
+        before.steps,
+        max(heat[:2]),
+        max(heat[2:]),
     ]
 
 
@@ -139,5 +155,8 @@ def from_numbers(values: Mapping[str, float]) -> RecordedStep:
     taken = [float(values[signal.name]) for signal in _MEASUREMENT]
     measurement = Measurement(taken[0], (taken[1], taken[2], taken[3], taken[4]), *taken[5:])
     # Integers and flags travel as numbers; the law has to get back the types it was compiled for.
-    settings = Settings(*(kind(values[_SETTING + name]) for name, kind in _SETTING_TYPES.items()))
+    # A setting that is younger than the record has its default.
+    settings = DEFAULTS._replace(
+        **{name: kind(values[_SETTING + name]) for name, kind in _SETTING_TYPES.items() if _SETTING + name in values}
+    )
     return RecordedStep(values["step"] == 0.0, measurement, settings)

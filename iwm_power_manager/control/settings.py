@@ -99,6 +99,22 @@ class Settings(NamedTuple):
     ] = 0.0
     # Measured slip says nothing at rest.
     slip_speed_floor_mps: Annotated[float, Setting("denominator of slip is at least this", "m/s", 0.01, 10.0)] = 1.0
+    # Left and right at unequal torques turn the car. At once only as much as a driver hardly feels; then it grows at
+    # the rate at which he can steer against it.
+    front_yaw_nm: Annotated[
+        float, Setting("yaw moment that unequal torques of the front wheels may have at once", "N m", 0.0, 1e5)
+    ] = 600.0
+    front_yaw_growth_nmps: Annotated[float, Setting("growth of it while it is used; 0 is none", "N m/s", 0.0, 1e6)] = (
+        2000.0
+    )
+    # The rear wheels keep the car straight: both get what the one with less grip can take (select-low).
+    rear_yaw_nm: Annotated[
+        float,
+        Setting(
+            "yaw moment that unequal torques of the rear wheels may have at once; 0 is select-low", "N m", 0.0, 1e5
+        ),
+    ] = 0.0
+    rear_yaw_growth_nmps: Annotated[float, Setting("growth of it while it is used; 0 is none", "N m/s", 0.0, 1e6)] = 0.0
     # From rest to the peak torque in 0.125 s; from there to zero in one step of 10 ms (gates and limits may be faster);
     # to full regeneration in 0.02 s.
     slew_up_nmps: Annotated[float, Setting("fastest growth of a driving motor torque", "N m/s", 10.0, 1e6)] = 1600.0

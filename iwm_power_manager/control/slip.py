@@ -1,4 +1,4 @@
-"""Slip of an axle from its wheels, and the slip limiter.
+"""Slip of an axle, and the slip limiter of a wheel.
 
 The limiter knows, from the last command and the wheel's acceleration, which torque the road is taking from the wheel.
 The largest torque it allows is that, plus what turns the wheel towards the target slip within a time constant. Far
@@ -9,7 +9,6 @@ almost its peak force, instead of letting it swing across the critical slip as T
 from __future__ import annotations
 
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.model.tyre import slip_ratio
 
 #: The limiter never steers to less than this slip speed, m/s: at walking pace a slip of 0.15 is within the noise.
 LEAST_SLIP_SPEED_MPS = 0.3
@@ -19,10 +18,8 @@ UNLIMITED_NM = 1e9
 
 
 @kernel
-def axle_slip(left_radps: float, right_radps: float, speed_mps: float, radius_m: float, floor_mps: float) -> float:
-    """Slip of the axle's worse wheel (eq. 10)."""
-    left = slip_ratio(left_radps, speed_mps, radius_m, floor_mps)
-    right = slip_ratio(right_radps, speed_mps, radius_m, floor_mps)
+def worse_slip(left: float, right: float) -> float:
+    """Slip of an axle: that of its worse wheel."""
     return left if abs(left) > abs(right) else right
 
 

@@ -6,12 +6,18 @@ strategy is written out here, from the table: plain comparisons of a number, whi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
+from iwm_power_manager.control.settings import Settings
+from iwm_power_manager.control.slew import approached
 from iwm_power_manager.control.strategies import seal
-from iwm_power_manager.control.strategy import Strategy
+from iwm_power_manager.control.strategy import Situation, Strategy
+from iwm_power_manager.control.table import PolicyTable
+from iwm_power_manager.control.types import Measurement, SplitMemory
 from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.parameters import VehicleParams
 
 #: A demand smaller than this is none, W: the split stays as it is.
 LEAST_DEMAND_W = 1.0
@@ -40,3 +46,52 @@ def _dispatcher(strategies: tuple[Strategy, ...]) -> Callable[..., Any]:
 
 #: Kernel (Situation, Settings, VehicleParams, PolicyTable) -> front share, 0..1.
 decide = kernel(_dispatcher(seal()))
+
+
+@kernel
+def split(
+    measurement: Measurement,
+    speed_mps: float,
+    front_slip: float,
+    rear_slip: float,
+    first: bool,
+    memory: SplitMemory,
+    settings: Settings,
+    vehicle: VehicleParams,
+    policy: PolicyTable,
+) -> SplitMemory:
+    """The split of this step: decided once a period, applied at a limited rate.
+
+    Parameters
+    ----------
+    speed_mps, front_slip, rear_slip : of the car and its axles
+    first : the first step of a run: what is decided is applied at once
+    """
+    decisions = memory.decisions
+    age = memory.age_s + measurement.dt_s
+    decided = memory.decided_share
+    recent = memory.recent_change
+    # Half a step of slack: sums of 0.01 s must not delay every tenth decision by a step.
+    if first or age >= settings.decision_period_s - 0.5 * measurement.dt_s:
+        recent *= math.exp(-age / settings.reversal_s)
+        situation = Situation(
+            power_demand_w=measurement.power_demand_w,
+            speed_mps=speed_mps,
+            front_slip=front_slip,
+            rear_slip=rear_slip,
+            previous_share=decided,
+            recent_change=recent,
+            friction=measurement.friction,
+            decisions=decisions,
+        )
+        decided = decide(situation, settings, vehicle, policy)
+        recent += decided - memory.decided_share
+        decisions += 1
+        age = 0.0
+    if first:
+        applied = decided
+    else:
+        applied = approached(memory.applied_share, decided, settings.share_rate_per_s * measurement.dt_s)
+    return SplitMemory(
+        decisions=decisions, age_s=age, decided_share=decided, applied_share=applied, recent_change=recent
+    )

@@ -73,10 +73,11 @@ class Command(NamedTuple):
     friction_torque_nm : torque of each friction brake, <= 0
     front_share : P_front / P_demand as applied in this step (after its rate limit), 0..1
     decided_share : the front share the strategy decided on, 0..1
-    gate : GATE_NONE, GATE_FRONT, GATE_REAR or GATE_BOTH
+    gate : GATE_NONE, GATE_FRONT, GATE_REAR or GATE_BOTH: axles whose wheels are both gated
     limits : LIMIT_* bits
-    front_power_w, rear_power_w : sum of (motor + friction torque) * conversion speed of the axle
-    front_slip, rear_slip : filtered slip the gate acted on
+    front_power_w, rear_power_w : sum over the axle's wheels of (motor + friction torque) * conversion speed
+    front_slip, rear_slip : filtered slip of the axle's worse wheel
+    gated_wheels : bits 1, 2, 4, 8 of the wheels held at zero torque, in the order of the wheels
     """
 
     motor_torque_nm: Wheels
@@ -89,6 +90,48 @@ class Command(NamedTuple):
     rear_power_w: float
     front_slip: float
     rear_slip: float
+    gated_wheels: int
+
+
+class WheelState(NamedTuple):
+    """What the law remembers of one wheel.
+
+    Attributes
+    ----------
+    motor_nm : motor torque of the last command
+    total_nm : the same with the friction brake
+    speed_radps : wheel speed in the last step
+    road_nm : filtered estimate of the torque the road takes from the wheel
+    slip : filtered slip
+    gated : held at zero torque
+    heat : heat index of the motor, 0 cold to 1 hot
+    """
+
+    motor_nm: float
+    total_nm: float
+    speed_radps: float
+    road_nm: float
+    slip: float
+    gated: bool
+    heat: float
+
+
+class SplitMemory(NamedTuple):
+    """What is remembered of the power split.
+
+    Attributes
+    ----------
+    decisions : decisions taken
+    age_s : time since the last one
+    decided_share, applied_share : front share, 0..1
+    recent_change : sum of the changes of the decided share, each fading out with `reversal_s`
+    """
+
+    decisions: int
+    age_s: float
+    decided_share: float
+    applied_share: float
+    recent_change: float
 
 
 class ControllerState(NamedTuple):
@@ -97,43 +140,23 @@ class ControllerState(NamedTuple):
     Attributes
     ----------
     steps : steps taken
-    decisions : decisions taken
-    decision_age_s : time since the last one
-    decided_share, applied_share : front share, 0..1
-    recent_change : sum of the changes of the decided share, each fading out with `reversal_s`
-    front_motor_nm, rear_motor_nm : motor torque of each wheel of the axle in the last command
-    front_total_nm, rear_total_nm : the same with the friction brake
-    front_speed_radps, rear_speed_radps : mean wheel speed of the axle in the last step
-    front_road_nm, rear_road_nm : filtered estimate of the torque the road takes from a wheel
-    front_slip, rear_slip : filtered slip
-    front_gated, rear_gated : Table 2
-    front_heat, rear_heat : heat index of the motors, 0 cold to 1 hot
+    split : of the power split
+    wheels : of each wheel
+    front_unequal_s, rear_unequal_s : how long the wheels of the axle have been kept at unequal torques; it lets their
+        yaw budget grow
     """
 
     steps: int
-    decisions: int
-    decision_age_s: float
-    decided_share: float
-    applied_share: float
-    recent_change: float
-    front_motor_nm: float
-    rear_motor_nm: float
-    front_total_nm: float
-    rear_total_nm: float
-    front_speed_radps: float
-    rear_speed_radps: float
-    front_road_nm: float
-    rear_road_nm: float
-    front_slip: float
-    rear_slip: float
-    front_gated: bool
-    rear_gated: bool
-    front_heat: float
-    rear_heat: float
+    split: SplitMemory
+    wheels: tuple[WheelState, WheelState, WheelState, WheelState]
+    front_unequal_s: float
+    rear_unequal_s: float
 
 
 def initial_state() -> ControllerState:
     """The law's memory before its first step: at rest, cold, power split equally."""
+    wheel = WheelState(motor_nm=0.0, total_nm=0.0, speed_radps=0.0, road_nm=0.0, slip=0.0, gated=False, heat=0.0)
+    split = SplitMemory(decisions=0, age_s=0.0, decided_share=0.5, applied_share=0.5, recent_change=0.0)
     return ControllerState(
-        0, 0, 0.0, 0.5, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False, False, 0.0, 0.0
+        steps=0, split=split, wheels=(wheel, wheel, wheel, wheel), front_unequal_s=0.0, rear_unequal_s=0.0
     )

@@ -158,14 +158,20 @@ def _axle_torque(
     power_w: float, wheel_speed_radps: float, speed_mps: float, vehicle: VehicleParams, problem: ProblemParams
 ) -> tuple[float, float, float]:
     """Motor and friction torque of one wheel for its axle's power, and the axle's power beyond the motor's limit."""
-    conversion = conversion_speed_radps(wheel_speed_radps, speed_mps, problem.critical_slip, vehicle)
+    conversion = conversion_speed_radps(
+        wheel_speed_radps,
+        speed_mps,
+        problem.critical_slip,
+        vehicle.front.wheel.radius_m,
+        vehicle.driver.power_speed_floor_mps,
+    )
     torque = 0.5 * power_w / conversion
     if torque > 0.0:
         limit = torque_limit_nm(wheel_speed_radps, 0.0, vehicle.front.motor)
         if torque > limit:
             return limit, 0.0, 2.0 * (torque - limit) * conversion
         return torque, 0.0, 0.0
-    motor, friction = blend(torque, wheel_speed_radps, speed_mps, 0.0, vehicle)
+    motor, friction = blend(torque, wheel_speed_radps, speed_mps, 0.0, vehicle.front.motor)
     return motor, max(friction, -vehicle.front.friction_brake.max_torque_nm), 0.0
 
 

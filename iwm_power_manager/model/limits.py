@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.motor import electrical_power_w
-from iwm_power_manager.model.parameters import Battery, Motor
+from iwm_power_manager.model.parameters import Battery, Motor, VehicleParams
 
 
 @kernel
@@ -76,4 +76,50 @@ def battery_scale(
         else:
             high = middle
     power = car_power_w(low * front_torque_nm, low * rear_torque_nm, front_speed_radps, rear_speed_radps, motor)
+    return low if -charge_limit_w <= power <= discharge_limit_w else 0.0
+
+
+@kernel
+def wheels_power_w(
+    torque_nm: tuple[float, float, float, float],
+    speed_radps: tuple[float, float, float, float],
+    factor: float,
+    vehicle: VehicleParams,
+) -> float:
+    """Electrical power of the four motors, W (eq. 23), with each torque times a factor."""
+    front = vehicle.front.motor
+    rear = vehicle.rear.motor
+    # Axle by axle: left and right alike give the bits of `car_power_w`.
+    return (
+        electrical_power_w(factor * torque_nm[0], speed_radps[0], front)
+        + electrical_power_w(factor * torque_nm[1], speed_radps[1], front)
+    ) + (
+        electrical_power_w(factor * torque_nm[2], speed_radps[2], rear)
+        + electrical_power_w(factor * torque_nm[3], speed_radps[3], rear)
+    )
+
+
+@kernel
+def wheels_scale(
+    torque_nm: tuple[float, float, float, float],
+    speed_radps: tuple[float, float, float, float],
+    discharge_limit_w: float,
+    charge_limit_w: float,
+    vehicle: VehicleParams,
+) -> float:
+    """As `battery_scale`, for four wheels that may differ."""
+    power = wheels_power_w(torque_nm, speed_radps, 1.0, vehicle)
+    if -charge_limit_w <= power <= discharge_limit_w:
+        return 1.0
+    charging = power < -charge_limit_w
+    low = 0.0
+    high = 1.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        power = wheels_power_w(torque_nm, speed_radps, middle, vehicle)
+        if (power >= -charge_limit_w) if charging else (power <= discharge_limit_w):
+            low = middle
+        else:
+            high = middle
+    power = wheels_power_w(torque_nm, speed_radps, low, vehicle)
     return low if -charge_limit_w <= power <= discharge_limit_w else 0.0

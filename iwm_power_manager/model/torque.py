@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.motor import regeneration_limit_nm
-from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.parameters import Motor
 
 
 @kernel
 def conversion_speed_radps(
-    wheel_speed_radps: float, speed_mps: float, critical_slip: float, vehicle: VehicleParams
+    wheel_speed_radps: float, speed_mps: float, critical_slip: float, radius_m: float, floor_mps: float
 ) -> float:
     """Speed by which a power is divided to get a torque, rad/s.
 
@@ -17,9 +17,8 @@ def conversion_speed_radps(
     divisor never falls below the wheel speed at the critical braking slip, nor below the speed floor. Inside the
     desired slip interval, above the floor, it is eq. 16 as printed.
     """
-    radius = vehicle.front.wheel.radius_m
-    held = speed_mps * (1.0 - critical_slip) / radius
-    return max(wheel_speed_radps, held, vehicle.driver.power_speed_floor_mps / radius)
+    held = speed_mps * (1.0 - critical_slip) / radius_m
+    return max(wheel_speed_radps, held, floor_mps / radius_m)
 
 
 @kernel
@@ -32,8 +31,28 @@ def allocate(front: float, rear: float, front_room: float, rear_room: float) -> 
 
 
 @kernel
+def between_wheels(
+    given_w: float,
+    left_conversion_radps: float,
+    right_conversion_radps: float,
+    left_room_nm: float,
+    right_room_nm: float,
+) -> tuple[float, float]:
+    """Torques of an axle's two wheels, N m >= 0, for a power of the axle: equal, where both have room for it.
+
+    A wheel that has less room gives what it can, the other one the rest.
+    """
+    equal = given_w / (left_conversion_radps + right_conversion_radps)
+    if left_room_nm == right_room_nm or equal <= min(left_room_nm, right_room_nm):
+        return equal, equal
+    if left_room_nm < right_room_nm:
+        return left_room_nm, max(given_w - left_room_nm * left_conversion_radps, 0.0) / right_conversion_radps
+    return max(given_w - right_room_nm * right_conversion_radps, 0.0) / left_conversion_radps, right_room_nm
+
+
+@kernel
 def blend(
-    torque_nm: float, wheel_speed_radps: float, speed_mps: float, heat: float, vehicle: VehicleParams
+    torque_nm: float, wheel_speed_radps: float, speed_mps: float, heat: float, motor: Motor
 ) -> tuple[float, float]:
     """Share a wheel's torque between its motor and its friction brake (eq. 20, 41, 42).
 
@@ -45,5 +64,5 @@ def blend(
     """
     if torque_nm >= 0.0:
         return torque_nm, 0.0
-    regeneration = min(-torque_nm, regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, vehicle.front.motor))
+    regeneration = min(-torque_nm, regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, motor))
     return -regeneration, torque_nm + regeneration

@@ -15,12 +15,12 @@ from typing import NamedTuple
 from iwm_power_manager.bags.metadata import Qos, Topic
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.writer import BagWriter
-from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS
 from iwm_power_manager.errors import BagError, IwmError
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import SignalStream, check_signals
-from iwm_power_manager.replay.steps import DECIDED_NAMES, ReconstructedSteps, RecordedSteps, ReplayedStep
+from iwm_power_manager.replay.steps import ReconstructedSteps, RecordedSteps, ReplayedStep
 from iwm_power_manager.signals.mapping import JOINT_STATE, SignalMapping, topic_named
 from iwm_power_manager.signals.readings import NamedValues, joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import definition_of
@@ -219,7 +219,7 @@ class Replay:
             return []
         names, values = recorded.names, recorded.values
         if kind == STATE:
-            found = dict(zip(names, values, strict=True))
+            found = YOUNGER_SIGNALS | dict(zip(names, values, strict=True))
             names, values = DECIDED_NAMES, tuple(found.get(name, math.nan) for name in DECIDED_NAMES)
         self._comparers[kind].recorded(recorded.stamp_ns, message.log_time_ns, names, values)
         return steps

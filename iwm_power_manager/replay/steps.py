@@ -20,7 +20,7 @@ from iwm_power_manager.control.monitor import (
     JointReading,
     SpeedReading,
 )
-from iwm_power_manager.control.record import SIGNAL_NAMES, from_numbers
+from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, decided, from_numbers
 from iwm_power_manager.control.stepping import AsRecorded, Lockstep, Taken
 from iwm_power_manager.control.thresholds import RECORDED, input_limits, supervision_limits
 from iwm_power_manager.control.types import Command, ControllerState, initial_state
@@ -108,10 +108,9 @@ class RecordedSteps:
         if problem:
             self.faults[problem] += 1
             return None
-        values.update(decided(command, before, after))
-        if plan.changes or not plan.keeps_friction:
-            values.update({f"setting.{name}": float(value) for name, value in settings._asdict().items()})
-            values["friction"] = measurement.friction
+        values.update(zip(DECIDED_NAMES, map(float, decided(command, before, after)), strict=True))
+        values.update({f"setting.{name}": float(value) for name, value in settings._asdict().items()})
+        values["friction"] = measurement.friction
         self._last = ReplayedStep(
             recorded.stamp_ns,
             log_time_ns,
@@ -235,19 +234,6 @@ class ReconstructedSteps:
         ]
 
 
-def decided(command: Command, before: ControllerState, after: ControllerState) -> dict[str, float]:
-    """The signals of `control.record` that the law decides, by name."""
-    numbers = [
-        *command.motor_torque_nm,
-        *command.friction_torque_nm,
-        *(float(value) for value in command[2:]),
-        float(before.steps),
-        after.front_heat,
-        after.rear_heat,
-    ]
-    return dict(zip(DECIDED_NAMES, numbers, strict=True))
-
-
 def _in_sets(probe: Iterable[Recorded]) -> bool:
     """Whether speed, wheel speeds and battery come with the same stamps, as in lock-step."""
     stamps: dict[type, set[int]] = {SpeedReading: set(), JointReading: set(), BatteryReading: set()}
@@ -259,7 +245,3 @@ def _in_sets(probe: Iterable[Recorded]) -> bool:
     common = set.intersection(*stamps.values())
     return len(common) > 1 and len(common) >= max(map(len, stamps.values())) - 2
 
-
-_FIRST_DECIDED = SIGNAL_NAMES.index("front_left_motor_torque_nm")
-#: The signals of `control.record` that the law decides.
-DECIDED_NAMES = tuple(SIGNAL_NAMES[_FIRST_DECIDED : SIGNAL_NAMES.index("rear_heat") + 1])

@@ -25,8 +25,22 @@ def vehicle() -> VehicleParams:
     )
 
 
-def command(motor=(0.0,) * 4, friction=(0.0,) * 4, gate=GATE_NONE) -> Command:
-    return Command(tuple(motor), tuple(friction), 0.5, 0.5, gate, 0, 0.0, 0.0, 0.0, 0.0)
+def command(motor=(0.0,) * 4, friction=(0.0,) * 4, gated_wheels=0, gate=None) -> Command:
+    if gate is None:
+        gate = (gated_wheels & 3 == 3) + 2 * (gated_wheels & 12 == 12)
+    return Command(
+        motor_torque_nm=tuple(motor),
+        friction_torque_nm=tuple(friction),
+        front_share=0.5,
+        decided_share=0.5,
+        gate=gate,
+        limits=0,
+        front_power_w=0.0,
+        rear_power_w=0.0,
+        front_slip=0.0,
+        rear_slip=0.0,
+        gated_wheels=gated_wheels,
+    )
 
 
 def one(index: int, value: float) -> tuple[float, ...]:
@@ -57,14 +71,27 @@ class TestEveryWheel:
             f"friction torque of wheel {wheel} is 1e-12 N m, outside -900..0"
         )
 
-    @pytest.mark.parametrize("gate", [GATE_FRONT, GATE_REAR, GATE_BOTH])
-    def test_a_gated_axle_has_no_torque_at_all(self, vehicle, wheel, gate) -> None:
-        gated = gate == GATE_BOTH or (gate == GATE_FRONT) == (wheel < 2)
+    @pytest.mark.parametrize("gated_wheels", [1, 2, 4, 8, 3, 12, 6, 15])
+    def test_a_gated_wheel_has_no_torque_at_all(self, vehicle, wheel, gated_wheels) -> None:
+        gated = bool(gated_wheels & (1, 2, 4, 8)[wheel])
         expected = f"wheel {wheel} is gated" if gated else ""
         for torque in (1e-9, -1e-9):
-            assert violated_bound(command(one(wheel, torque), gate=gate), vehicle).startswith(expected)
-        assert violated_bound(command(friction=one(wheel, -1e-9), gate=gate), vehicle).startswith(expected)
-        assert bool(violated_bound(command(one(wheel, 1.0), gate=gate), vehicle)) == gated
+            assert violated_bound(command(one(wheel, torque), gated_wheels=gated_wheels), vehicle).startswith(expected)
+        held = violated_bound(command(friction=one(wheel, -1e-9), gated_wheels=gated_wheels), vehicle)
+        assert held.startswith(expected)
+        assert bool(violated_bound(command(one(wheel, 1.0), gated_wheels=gated_wheels), vehicle)) == gated
+
+
+def test_each_axle_has_its_own_bounds(vehicle) -> None:
+    weaker = vehicle._replace(
+        rear=vehicle.rear._replace(
+            motor=vehicle.rear.motor._replace(peak_torque_nm=PEAK / 2),
+            friction_brake=vehicle.rear.friction_brake._replace(max_torque_nm=BRAKE / 2),
+        )
+    )
+    for wheel in range(4):
+        assert bool(violated_bound(command(one(wheel, 0.6 * PEAK)), weaker)) == (wheel >= 2)
+        assert bool(violated_bound(command(friction=one(wheel, -0.6 * BRAKE)), weaker)) == (wheel >= 2)
 
 
 @pytest.mark.parametrize("gate", [-1, 4])
@@ -72,6 +99,11 @@ def test_a_gate_that_does_not_exist_is_seen(vehicle, gate) -> None:
     assert violated_bound(command(gate=gate), vehicle) == f"gate {gate} does not exist"
 
 
-@pytest.mark.parametrize("gate", [GATE_NONE, GATE_FRONT, GATE_REAR, GATE_BOTH])
-def test_zero_torque_is_always_allowed(vehicle, gate) -> None:
-    assert violated_bound(command(gate=gate), vehicle) == ""
+@pytest.mark.parametrize(("gate", "gated_wheels"), [(GATE_FRONT, 1), (GATE_NONE, 3), (GATE_BOTH, 12), (GATE_REAR, 3)])
+def test_a_gate_that_is_not_that_of_its_wheels_is_seen(vehicle, gate, gated_wheels) -> None:
+    assert "is not that of the gated wheels" in violated_bound(command(gate=gate, gated_wheels=gated_wheels), vehicle)
+
+
+@pytest.mark.parametrize("gated_wheels", range(16))
+def test_zero_torque_is_always_allowed(vehicle, gated_wheels) -> None:
+    assert violated_bound(command(gated_wheels=gated_wheels), vehicle) == ""

@@ -20,7 +20,14 @@ from iwm_power_manager.control.settings import (
 )
 from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import Command, ControllerState, Measurement, initial_state
+from iwm_power_manager.control.types import (
+    Command,
+    ControllerState,
+    Measurement,
+    SplitMemory,
+    WheelState,
+    initial_state,
+)
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -37,6 +44,15 @@ CARS = {
     for name in ("none", "drag", "enabled")
 }
 CAR = CARS["drag"]
+#: Weaker and smaller behind.
+CARS["unequal"] = CAR._replace(
+    rear=CAR.rear._replace(
+        motor=CAR.rear.motor._replace(max_power_w=4000.0, peak_torque_nm=120.0, loss_linear_torque=3.0),
+        wheel=CAR.rear.wheel._replace(radius_m=0.3, inertia_kgm2=0.8),
+        friction_brake=CAR.rear.friction_brake._replace(max_torque_nm=400.0),
+        track_width_m=1.2,
+    )
+)
 RADIUS = CAR.front.wheel.radius_m
 TABLE = empty_table(rule=(300.0, 0.4, -200.0, 0.7), schedule=(0.5, 0.0, 1.0, 0.3, 0.85, 1.0))
 DEFAULT = default_settings("equal")
@@ -62,35 +78,42 @@ class Case(NamedTuple):
     def braking(self):
         return self.m.power_demand_w < 0.0
 
-    def axles(self):
-        """Front and rear: wheel speeds, motor and friction torque, torque and heat before, whether it is gated."""
-        c, b, w = self.command, self.before, self.m.wheel_speed_radps
-        return (
-            (w[:2], c.motor_torque_nm[0], c.friction_torque_nm[0], b.front_motor_nm, b.front_heat, c.gate & 1),
-            (w[2:], c.motor_torque_nm[2], c.friction_torque_nm[2], b.rear_motor_nm, b.rear_heat, c.gate & 2),
-        )
+    def axle(self, i):
+        return self.car.front if i < 2 else self.car.rear
 
-    def conversion(self, wheels):
-        held = self.m.speed_mps * (1.0 - self.settings.critical_slip) / RADIUS
-        return max(0.5 * sum(wheels), held, self.car.driver.power_speed_floor_mps / RADIUS)
+    def wheels(self):
+        """Each wheel: speed, motor and friction torque, torque and heat before, whether it is gated."""
+        c, b, w = self.command, self.before, self.m.wheel_speed_radps
+        return [
+            (w[i], c.motor_torque_nm[i], c.friction_torque_nm[i], b.wheels[i].motor_nm, b.wheels[i].heat,
+             bool(c.gated_wheels >> i & 1))
+            for i in range(4)
+        ]  # fmt: skip
+
+    def conversion(self, i):
+        radius = self.axle(i).wheel.radius_m
+        held = self.m.speed_mps * (1.0 - self.settings.critical_slip) / radius
+        return max(self.m.wheel_speed_radps[i], held, self.car.driver.power_speed_floor_mps / radius)
+
+    def fast(self, i):
+        return max(self.m.wheel_speed_radps[i], self.conversion(i))
 
     def delivered_w(self):
         """Power of motors and brakes at the speeds that turn power into torque."""
-        return sum(2.0 * self.conversion(wheels) * (motor + brake) for wheels, motor, brake, *_ in self.axles())
+        return sum(self.conversion(i) * (motor + brake) for i, (_, motor, brake, *_) in enumerate(self.wheels()))
 
     def grip_nm(self, i):
-        """What the slip limiter leaves an axle."""
+        """What the slip limiter leaves a wheel."""
         if self.settings.gate_mode != GATE_MODE_LIMITER:
             return math.inf
-        wheels = self.axles()[i][0]
-        road = (self.after.front_road_nm, self.after.rear_road_nm)[i]
-        worst = min(wheels) if self.braking else max(wheels)
-        return oracle.grip(self.braking, road, worst, self.m.speed_mps, self.settings, self.car)
+        wheel = self.m.wheel_speed_radps[i]
+        road = self.after.wheels[i].road_nm
+        return oracle.grip(self.braking, road, wheel, self.m.speed_mps, self.settings, self.axle(i))
 
     def battery_w(self, factor=1.0):
         return sum(
-            2.0 * electrical_w(factor * motor, 0.5 * sum(wheels), self.car.front.motor)
-            for wheels, motor, *_ in self.axles()
+            electrical_w(factor * motor, wheel, self.axle(i).motor)
+            for i, (wheel, motor, *_) in enumerate(self.wheels())
         )
 
 
@@ -157,37 +180,59 @@ TUNINGS = st.builds(
     slip_filter_s=st.sampled_from((0.0, 0.02)),
     slip_speed_floor_mps=st.sampled_from((0.5, 1.0)),
     reversal_s=st.sampled_from((0.5, 0.01)),
+    front_yaw_nm=st.sampled_from((0.0, 600.0, 1e5)),
+    front_yaw_growth_nmps=st.sampled_from((0.0, 2000.0)),
+    rear_yaw_nm=st.sampled_from((0.0, 300.0)),
+    rear_yaw_growth_nmps=st.sampled_from((0.0, 500.0)),
     slew_up_nmps=st.sampled_from((1600.0, 300.0)),
     slew_down_nmps=st.sampled_from((20000.0, 900.0)),
     slew_regeneration_nmps=st.sampled_from((4000.0, 500.0)),
 )
 
 #: Any state the law may find itself in, whether a drive can lead there or not.
-MEMORIES = st.builds(
-    lambda front_brake, rear_brake, **rest: ControllerState(
-        front_total_nm=rest["front_motor_nm"] + front_brake, rear_total_nm=rest["rear_motor_nm"] + rear_brake, **rest
-    ),
-    front_brake=BRAKES,
-    rear_brake=BRAKES,
-    steps=st.integers(0, 2),
-    decisions=st.integers(0, 9),
-    decision_age_s=AGES,
-    decided_share=SHARES,
-    applied_share=SHARES,
-    recent_change=st.floats(-2.0, 2.0),
-    front_motor_nm=TORQUES,
-    rear_motor_nm=TORQUES,
-    front_speed_radps=WHEELS,
-    rear_speed_radps=WHEELS,
-    front_road_nm=ROADS,
-    rear_road_nm=ROADS,
-    front_slip=SLIPS,
-    rear_slip=SLIPS,
-    front_gated=st.booleans(),
-    rear_gated=st.booleans(),
-    front_heat=HEATS,
-    rear_heat=HEATS,
+WHEEL_STATES = st.builds(
+    lambda brake, **rest: WheelState(total_nm=rest["motor_nm"] + brake, **rest),
+    brake=BRAKES,
+    motor_nm=TORQUES,
+    speed_radps=WHEELS,
+    road_nm=ROADS,
+    slip=SLIPS,
+    gated=st.booleans(),
+    heat=HEATS,
 )
+#: Left and right alike, as on an even road, and all different.
+FOUR_STATES = st.one_of(
+    st.tuples(WHEEL_STATES, WHEEL_STATES).map(lambda axles: (axles[0], axles[0], axles[1], axles[1])),
+    st.tuples(WHEEL_STATES, WHEEL_STATES, WHEEL_STATES, WHEEL_STATES),
+)
+MEMORIES = st.builds(
+    ControllerState,
+    steps=st.integers(0, 2),
+    split=st.builds(
+        SplitMemory,
+        decisions=st.integers(0, 9),
+        age_s=AGES,
+        decided_share=SHARES,
+        applied_share=SHARES,
+        recent_change=st.floats(-2.0, 2.0),
+    ),
+    wheels=FOUR_STATES,
+    front_unequal_s=AGES,
+    rear_unequal_s=AGES,
+)
+
+
+def memory(front=None, rear=None, **split):
+    """The state after one step, with these changes."""
+    start = initial_state()
+    front_wheel, rear_wheel = (start.wheels[0]._replace(**(changes or {})) for changes in (front, rear))
+    wheels = (front_wheel, front_wheel, rear_wheel, rear_wheel)
+    return start._replace(steps=1, wheels=wheels, split=start.split._replace(**split))
+
+
+def numbers_in(value):
+    """Every number of nested tuples."""
+    return [x for item in value for x in numbers_in(item)] if isinstance(value, tuple) else [value]
 
 
 CASES = st.builds(take, measurements(), MEMORIES, TUNINGS, st.sampled_from(list(CARS.values())))
@@ -197,46 +242,94 @@ CASES = st.builds(take, measurements(), MEMORIES, TUNINGS, st.sampled_from(list(
 
 
 def every_number_is_finite(case):
-    flat = [*case.command[0], *case.command[1], *case.command[2:], *case.after]
-    assert all(math.isfinite(x) for x in flat)
+    assert all(math.isfinite(x) for x in numbers_in((case.command, case.after)))
 
 
 def the_motors_stay_within_torque_and_power(case):
-    for wheels, motor, _, _, heat, _ in case.axles():
-        fastest = max(*wheels, 0.0)
-        assert motor <= torque_limit(fastest, heat, case.car.front.motor) * (1.0 + 1e-12)
-        assert abs(motor) * fastest <= case.car.front.motor.max_power_w * (1.0 + 1e-12)
+    for i, (wheel, motor, _, _, heat, _) in enumerate(case.wheels()):
+        fastest = max(wheel, 0.0)
+        assert motor <= torque_limit(fastest, heat, case.axle(i).motor) * (1.0 + 1e-12)
+        assert abs(motor) * fastest <= case.axle(i).motor.max_power_w * (1.0 + 1e-12)
 
 
 def regeneration_stays_within_its_limit_and_fades_at_low_speed(case):
-    for wheels, motor, _, _, heat, _ in case.axles():
-        limit = regeneration_limit(max(*wheels, 0.0), case.m.speed_mps, heat, case.car.front.motor)
+    for i, (wheel, motor, _, _, heat, _) in enumerate(case.wheels()):
+        limit = regeneration_limit(max(wheel, 0.0), case.m.speed_mps, heat, case.axle(i).motor)
         assert motor >= -limit - TORQUE_SLACK_NM
 
 
 def friction_brakes_only_brake_and_only_on_demand(case):
-    for _, _, brake, *_ in case.axles():
-        assert -case.car.front.friction_brake.max_torque_nm <= brake <= 0.0
+    for i, (_, _, brake, *_) in enumerate(case.wheels()):
+        assert -case.axle(i).friction_brake.max_torque_nm <= brake <= 0.0
         assert case.braking or brake == 0.0
 
 
-def left_and_right_get_the_same(case):
-    for torque in (case.command.motor_torque_nm, case.command.friction_torque_nm):
-        assert torque[0] == torque[1]
-        assert torque[2] == torque[3]
+def the_yaw_budget_of_an_axle_is_kept(case):
+    # What the motors' slew and the battery do about it is short; what is asked of motor and brake together is not.
+    if not case.braking or case.command.limits & (t.LIMIT_SLEW | t.LIMIT_FRICTION_BRAKE):
+        return
+    s, b = case.settings, case.before
+    total = [motor + brake for _, motor, brake, *_ in case.wheels()]
+    for k, budget in (
+        (0, s.front_yaw_nm + s.front_yaw_growth_nmps * b.front_unequal_s),
+        (2, s.rear_yaw_nm + s.rear_yaw_growth_nmps * b.rear_unequal_s),
+    ):
+        axle = case.axle(k)
+        moment = abs(total[k] - total[k + 1]) / axle.wheel.radius_m * 0.5 * axle.track_width_m
+        assert moment <= budget * (1.0 + 1e-9) + 1e-6
 
 
-def a_gated_axle_has_no_torque_at_all(case):
-    assert case.command.gate == case.after.front_gated + 2 * case.after.rear_gated
-    for _, motor, brake, _, _, gated in case.axles():
-        assert not gated or (motor == 0.0 and brake == 0.0)
+def alike_on_both_sides_is_commanded_alike(case):
+    w, states = case.m.wheel_speed_radps, case.before.wheels
+    for k in (0, 2):
+        if w[k] == w[k + 1] and states[k] == states[k + 1]:
+            assert case.command.motor_torque_nm[k] == case.command.motor_torque_nm[k + 1]
+            assert case.command.friction_torque_nm[k] == case.command.friction_torque_nm[k + 1]
+
+
+def mirrored(case):
+    """The same step with left and right exchanged."""
+    order = (1, 0, 3, 2)
+    return (
+        case.m._replace(wheel_speed_radps=tuple(case.m.wheel_speed_radps[i] for i in order)),
+        case.before._replace(wheels=tuple(case.before.wheels[i] for i in order)),
+    )
+
+
+def left_and_right_exchanged_exchange_the_command(case):
+    command, after = law.step(*mirrored(case), case.settings, case.car, TABLE)
+    for ours, other in (
+        (case.command.motor_torque_nm, command.motor_torque_nm),
+        (case.command.friction_torque_nm, command.friction_torque_nm),
+        ([w.heat for w in case.after.wheels], [w.heat for w in after.wheels]),
+        ([w.road_nm for w in case.after.wheels], [w.road_nm for w in after.wheels]),
+    ):
+        near = pytest.approx([other[i] for i in (1, 0, 3, 2)], rel=1e-9, abs=1e-6)
+        assert list(ours) == near or case.command.limits & (t.LIMIT_BATTERY_CHARGE | t.LIMIT_BATTERY_DISCHARGE)
+    assert [w.gated for w in after.wheels] == [case.after.wheels[i].gated for i in (1, 0, 3, 2)] or printed_tie(case)
+
+
+def printed_tie(case):
+    """Table 2 as printed goes by the worse wheel; of two equally bad ones, with opposite signs, the right one."""
+    w = case.after.wheels
+    return any(abs(w[k].slip) == abs(w[k + 1].slip) for k in (0, 2))
+
+
+def a_gated_wheel_has_no_torque_at_all(case):
+    gated = [wheel.gated for wheel in case.after.wheels]
+    assert case.command.gated_wheels == sum(1 << i for i in range(4) if gated[i])
+    assert case.command.gate == (gated[0] and gated[1]) + 2 * (gated[2] and gated[3])
+    for _, motor, brake, _, _, held in case.wheels():
+        assert not held or (motor == 0.0 and brake == 0.0)
     if case.settings.gate_mode == GATE_MODE_OFF:
-        assert case.command.gate == t.GATE_NONE
+        assert not any(gated)
+    if case.settings.gate_mode == GATE_MODE_TABLE2 and case.before.wheels[0] == case.before.wheels[1]:
+        assert gated[0] == gated[1]
 
 
 def torque_grows_no_faster_than_its_rate(case):
     dt, s = case.m.dt_s, case.settings
-    for _, motor, _, before, *_ in case.axles():
+    for _, motor, _, before, *_ in case.wheels():
         slack = TORQUE_SLACK_NM + 1e-12 * abs(before)
         assert motor <= max(before, 0.0) + s.slew_up_nmps * dt + slack
         assert motor >= min(before, 0.0) - s.slew_regeneration_nmps * dt - slack
@@ -245,18 +338,17 @@ def torque_grows_no_faster_than_its_rate(case):
 def torque_falls_no_faster_than_its_rate_but_by_a_gate_or_a_limit(case):
     fall = case.settings.slew_down_nmps * case.m.dt_s
     battery = t.LIMIT_BATTERY_CHARGE | t.LIMIT_BATTERY_DISCHARGE
-    for i, (wheels, motor, _, before, heat, gated) in enumerate(case.axles()):
+    for i, (_, motor, _, before, heat, gated) in enumerate(case.wheels()):
         if gated or case.command.limits & battery or abs(before) <= fall:
             continue
         towards_zero = math.copysign(abs(before) - fall, before)
-        fast = max(*wheels, case.conversion(wheels))
         if before > 0.0:
-            room = torque_limit(fast, heat, case.car.front.motor)
+            room = torque_limit(case.fast(i), heat, case.axle(i).motor)
             if not case.braking:
                 room = min(room, case.grip_nm(i))
             assert motor >= min(towards_zero, room) - 1e-6
         else:
-            room = regeneration_limit(fast, case.m.speed_mps, heat, case.car.front.motor)
+            room = regeneration_limit(case.fast(i), case.m.speed_mps, heat, case.axle(i).motor)
             if case.braking:
                 room = min(room, case.grip_nm(i))
             assert motor <= max(towards_zero, -room) + 1e-6
@@ -266,23 +358,22 @@ def without_gate_and_limit_the_torques_sum_to_the_demand(case):
     assert case.delivered_w() == pytest.approx(
         case.command.front_power_w + case.command.rear_power_w, abs=1e-6, rel=1e-9
     )
-    if case.command.gate == t.GATE_NONE and case.command.limits == 0:
+    if case.command.gated_wheels == 0 and case.command.limits == 0:
         assert case.delivered_w() == pytest.approx(case.m.power_demand_w, rel=1e-9, abs=POWER_SLACK_W)
 
 
 def braking_always_gets_through(case):
-    if not case.braking or case.command.gate == t.GATE_BOTH or case.command.limits & t.LIMIT_SLIP:
+    if not case.braking or case.command.gated_wheels or case.command.limits & t.LIMIT_SLIP:
         return
-    most = case.car.front.friction_brake.max_torque_nm
-    axles = case.axles()
-    possible = sum(2.0 * case.conversion(wheels) * most for wheels, *_, gated in axles if not gated)
-    owed = max(case.m.power_demand_w, -possible)
-    if any(motor > 0.0 and brake == -most for _, motor, brake, *_ in axles):
+    wheels = case.wheels()
+    most = [case.axle(i).friction_brake.max_torque_nm for i in range(4)]
+    owed = max(case.m.power_demand_w, -sum(case.conversion(i) * most[i] for i in range(4)))
+    if any(motor > 0.0 and brake == -most[i] for i, (_, motor, brake, *_) in enumerate(wheels)):
         return  # a full brake has nothing left to hold against a motor on its way down from driving
     slack = POWER_SLACK_W + 1e-9 * abs(owed)
     assert case.delivered_w() <= owed + slack
     # More than asked is only what a regenerating motor still does on its way to zero.
-    if not any(brake == 0.0 and before < motor < 0.0 for _, motor, brake, before, *_ in axles):
+    if not any(brake == 0.0 and before < motor < 0.0 for _, motor, brake, before, *_ in wheels):
         assert case.delivered_w() >= owed - slack
 
 
@@ -292,7 +383,7 @@ def the_battery_s_limits_hold_wherever_torque_can_help(case):
         pytest.fail(f"charges with {-power} W, allowed {m.charge_limit_w} W")
     if power > m.discharge_limit_w + POWER_SLACK_W:
         # Not even zero torque is within the limit.
-        assert all(motor == 0.0 for _, motor, *_ in case.axles())
+        assert all(motor == 0.0 for _, motor, *_ in case.wheels())
         assert power == pytest.approx(case.battery_w(0.0))
 
 
@@ -300,12 +391,12 @@ def shares_stay_between_nothing_and_everything(case):
     assert 0.0 <= case.command.front_share <= 1.0
     assert 0.0 <= case.command.decided_share <= 1.0
     if case.before.steps > 0:
-        change = abs(case.command.front_share - case.before.applied_share)
+        change = abs(case.command.front_share - case.before.split.applied_share)
         assert change <= case.settings.share_rate_per_s * case.m.dt_s + 1e-12
 
 
 def the_limiter_s_room_is_kept(case):
-    for i, (_, motor, brake, *_) in enumerate(case.axles()):
+    for i, (_, motor, brake, *_) in enumerate(case.wheels()):
         if case.braking:
             assert -motor - brake <= case.grip_nm(i) + 1e-6
         else:
@@ -313,7 +404,7 @@ def the_limiter_s_room_is_kept(case):
 
 
 def nothing_pushes_against_the_demand_but_what_is_on_its_way_to_zero(case):
-    for _, motor, _, before, *_ in case.axles():
+    for _, motor, _, before, *_ in case.wheels():
         assert motor <= 0.0 if case.braking and before <= 0.0 else True
         assert motor >= 0.0 if not case.braking and before >= 0.0 else True
 
@@ -335,44 +426,45 @@ def it_does_what_the_plain_law_does(case):
         if case.settings.strategy == EQUAL:
             return 0.5
         if case.settings.strategy == PREVIEW:
-            return TABLE.schedule[min(case.before.decisions, len(TABLE.schedule) - 1)]
+            return TABLE.schedule[min(case.before.split.decisions, len(TABLE.schedule) - 1)]
         small = abs(case.m.power_demand_w) < 1.0
-        return case.before.decided_share if small else rule(case.m.power_demand_w, TABLE.rule)
+        return case.before.split.decided_share if small else rule(case.m.power_demand_w, TABLE.rule)
 
     axles, share, decided, bits = oracle.step(case.m, case.before, case.settings, case.car, decide)
     command, after = case.command, case.after
-    if math.isnan(axles[0].motor + axles[1].motor) or axles[0].doubtful or axles[1].doubtful:
+    wheels = [wheel for axle in axles for wheel in axle.wheels]
+    if math.isnan(sum(wheel.motor for wheel in wheels)) or any(wheel.doubtful for wheel in wheels):
         return  # several answers are right: battery and gate have checks of their own
 
     def near(value):
         return pytest.approx(value, rel=1e-8, abs=1e-7)
 
-    ours = [(motor, brake) for _, motor, brake, *_ in case.axles()]
-    assert ours == [(near(a.motor), near(a.friction)) for a in axles]
-    assert command.gate == axles[0].gated + 2 * axles[1].gated
+    ours = [(motor, brake) for _, motor, brake, *_ in case.wheels()]
+    assert ours == [(near(a.motor), near(a.friction)) for a in wheels]
+    assert [state.gated for state in after.wheels] == [a.gated for a in wheels]
     assert (command.front_slip, command.rear_slip) == (near(axles[0].slip), near(axles[1].slip))
     assert (command.front_share, command.decided_share) == (near(share), near(decided))
     assert {name for bit, name in t.LIMIT_NAMES.items() if command.limits & bit} == {t.LIMIT_NAMES[x] for x in bits}
-    for i, name in enumerate(("front", "rear")):
-        assert getattr(after, f"{name}_motor_nm") == ours[i][0]
-        assert getattr(after, f"{name}_total_nm") == near(sum(ours[i]))
-        assert getattr(after, f"{name}_speed_radps") == near(axles[i].speed)
-        assert getattr(after, f"{name}_road_nm") == near(axles[i].road)
-        assert getattr(after, f"{name}_slip") == getattr(command, f"{name}_slip")
-        heat, tau = getattr(case.before, f"{name}_heat"), case.car.front.motor.thermal_time_constant_s
-        target = (ours[i][0] / case.car.front.motor.continuous_torque_nm) ** 2
-        assert getattr(after, f"{name}_heat") == near(oracle.low_pass(heat, target, case.m.dt_s, tau))
-    assert (after.decided_share, after.applied_share) == (command.decided_share, command.front_share)
+    for i, state in enumerate(after.wheels):
+        assert state.motor_nm == ours[i][0]
+        assert state.total_nm == near(sum(ours[i]))
+        assert state.speed_radps == case.m.wheel_speed_radps[i]
+        assert state.road_nm == near(wheels[i].road)
+        assert state.slip == near(wheels[i].slip)
+        motor = case.axle(i).motor
+        target = (ours[i][0] / motor.continuous_torque_nm) ** 2
+        heat = oracle.low_pass(case.before.wheels[i].heat, target, case.m.dt_s, motor.thermal_time_constant_s)
+        assert state.heat == near(heat)
+    assert (after.split.decided_share, after.split.applied_share) == (command.decided_share, command.front_share)
     assert after.steps == case.before.steps + 1
-    taken = case.before.steps == 0 or (
-        case.before.decision_age_s + 1.5 * case.m.dt_s >= case.settings.decision_period_s
-    )
-    assert after.decisions == case.before.decisions + taken
-    age = case.before.decision_age_s + case.m.dt_s
-    assert after.decision_age_s == near(0.0 if taken else age)
+    before = case.before.split
+    taken = case.before.steps == 0 or before.age_s + 1.5 * case.m.dt_s >= case.settings.decision_period_s
+    assert after.split.decisions == before.decisions + taken
+    age = before.age_s + case.m.dt_s
+    assert after.split.age_s == near(0.0 if taken else age)
     fading = math.exp(-age / case.settings.reversal_s) if taken else 1.0
-    moved = after.decided_share - case.before.decided_share
-    assert after.recent_change == near(case.before.recent_change * fading + moved)
+    moved = after.split.decided_share - before.decided_share
+    assert after.split.recent_change == near(before.recent_change * fading + moved)
 
 
 CHECKS = (
@@ -380,8 +472,10 @@ CHECKS = (
     the_motors_stay_within_torque_and_power,
     regeneration_stays_within_its_limit_and_fades_at_low_speed,
     friction_brakes_only_brake_and_only_on_demand,
-    left_and_right_get_the_same,
-    a_gated_axle_has_no_torque_at_all,
+    alike_on_both_sides_is_commanded_alike,
+    left_and_right_exchanged_exchange_the_command,
+    the_yaw_budget_of_an_axle_is_kept,
+    a_gated_wheel_has_no_torque_at_all,
     torque_grows_no_faster_than_its_rate,
     torque_falls_no_faster_than_its_rate_but_by_a_gate_or_a_limit,
     without_gate_and_limit_the_torques_sum_to_the_demand,
@@ -473,7 +567,7 @@ def test_an_axle_is_freed_only_when_its_slip_is_back_inside_by_the_hysteresis():
 
 def test_a_gate_cuts_at_once_and_the_way_back_is_slew_limited():
     before = settle(measurement(demand=-6000.0), TABLE2).after
-    assert before.front_motor_nm < -20.0
+    assert before.wheels[0].motor_nm < -20.0
     slow = TABLE2._replace(slew_regeneration_nmps=1000.0)
     gated = take(measurement(demand=-6000.0, slips=(-0.3, 0.0)), before, slow)
     assert gated.command.motor_torque_nm[0] == 0.0
@@ -492,7 +586,7 @@ def test_the_split_is_decided_once_a_period(dt, period, taken):
     s, state, steps = DEFAULT._replace(strategy=PREVIEW, decision_period_s=period), initial_state(), []
     for k in range(10):
         before, state = state, take(measurement(dt=dt), state, s).after
-        if state.decisions > before.decisions:
+        if state.split.decisions > before.split.decisions:
             steps.append(k)
     assert steps == list(taken)
 
@@ -502,7 +596,7 @@ def test_the_law_remembers_what_it_changed_just_now_and_is_slow_to_take_it_back(
     s, car, m = DEFAULT._replace(strategy=SDP_LOOKAHEAD), CARS["none"], measurement(speed=10.0, demand=1000.0)
 
     def decided(recent, age_s=0.02):
-        before = initial_state()._replace(steps=1, decision_age_s=age_s, recent_change=recent)
+        before = memory(age_s=age_s, recent_change=recent)
         return law.step(m, before, s, car, table)[0].decided_share
 
     free = decided(0.0)
@@ -532,11 +626,12 @@ def test_what_one_axle_s_motors_cannot_give_the_other_s_do():
 
 
 def test_a_hot_motor_gives_its_continuous_torque_and_says_so():
-    hot = initial_state()._replace(steps=1, front_heat=1.0, rear_heat=1.0, applied_share=0.5)
+    hot = memory(front={"heat": 1.0}, rear={"heat": 1.0})
     m = measurement(speed=5.0, demand=10e3)
     case = take(m, hot)
     for _ in range(100):
-        case = take(m, case.after._replace(front_heat=1.0, rear_heat=1.0))
+        wheels = tuple(wheel._replace(heat=1.0) for wheel in case.after.wheels)
+        case = take(m, case.after._replace(wheels=wheels))
     assert case.command.motor_torque_nm == pytest.approx((80.0,) * 4)
     assert case.command.limits == t.LIMIT_MOTOR | t.LIMIT_THERMAL
 
@@ -545,7 +640,7 @@ def test_an_axle_that_helps_out_up_to_its_limit_is_at_its_limit():
     # The front axle is asked for little and hot; it gives all it can of what the rear one cannot.
     preview = default_settings("preview")._replace(gate_mode=GATE_MODE_OFF)
     table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + 0.2)
-    hot = initial_state()._replace(steps=1, front_heat=1.0, applied_share=0.2, decided_share=0.2)
+    hot = memory(front={"heat": 1.0}, applied_share=0.2, decided_share=0.2)
     command, _ = law.step(measurement(speed=5.0, demand=12e3), hot, preview, CAR, table)
     assert command.limits & ~t.LIMIT_SLEW == t.LIMIT_MOTOR | t.LIMIT_THERMAL
 
@@ -567,7 +662,7 @@ def test_where_grip_is_lost_torque_is_cut_at_once_however_slow_its_slew(demand):
     slip = math.copysign(0.14, demand)
     # The wheels run away within one step: the road takes nothing any more.
     slipping = take(measurement(slips=(slip, slip), demand=demand), gripping.after, slow)
-    for i, (_, motor, _, before, _, gated) in enumerate(slipping.axles()):
+    for i, (_, motor, _, before, _, gated) in enumerate(slipping.wheels()):
         assert not gated
         assert abs(before) > 20.0
         assert abs(motor) <= slipping.grip_nm(i) + TORQUE_SLACK_NM
@@ -586,7 +681,7 @@ def test_regeneration_on_its_way_down_is_not_driven_against():
 def test_a_little_friction_is_told_like_much(front_share):
     preview = default_settings("preview")._replace(gate_mode=GATE_MODE_OFF)
     table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + front_share)
-    before = initial_state()._replace(steps=1, applied_share=front_share, decided_share=front_share)
+    before = memory(applied_share=front_share, decided_share=front_share)
     demand = -2.0 * (80.0 + 0.5) * 15.0 / RADIUS
     command, _ = law.step(measurement(demand=demand), before, preview, CAR, table)
     assert command.limits & ~t.LIMIT_SLEW == t.LIMIT_REGENERATION
@@ -597,8 +692,8 @@ def test_a_little_friction_is_told_like_much(front_share):
 def test_rounding_is_no_limit():
     preview = default_settings("preview")
     table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + 0.3)
-    wheels = {"front_speed_radps": 15.0 / RADIUS, "rear_speed_radps": 15.0 / RADIUS}
-    before = initial_state()._replace(steps=1, applied_share=0.3, decided_share=0.3, **wheels)
+    rolling = {"speed_radps": 15.0 / RADIUS}
+    before = memory(rolling, rolling, applied_share=0.3, decided_share=0.3)
     for demand in range(1000, 8000, 37):
         command, _ = law.step(measurement(demand=float(demand)), before, preview, CAR, table)
         assert command.limits & ~t.LIMIT_SLEW == 0

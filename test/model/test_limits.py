@@ -86,7 +86,9 @@ def test_the_car_takes_what_its_four_motors_take(front, rear, front_speed, rear_
 def test_the_scale_is_the_largest_factor_inside_the_limits(
     front, rear, front_speed, rear_speed, discharge, charge, car
 ):
-    factor, _ = battery_factor((front, rear), (front_speed, rear_speed), discharge, charge, car.front.motor)
+    motor = car.front.motor
+    torques, speeds = (front, front, rear, rear), (front_speed, front_speed, rear_speed, rear_speed)
+    factor, _ = battery_factor(torques, speeds, discharge, charge, (motor,) * 4)
     assume(not math.isnan(factor))
     ours = battery_scale(front, rear, front_speed, rear_speed, discharge, charge, car.front.motor)
     assert ours == pytest.approx(factor, rel=1e-9, abs=1e-9)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iwm_power_manager.model.torque import allocate, blend, conversion_speed_radps
+from iwm_power_manager.model.torque import allocate, between_wheels, blend, conversion_speed_radps
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from oracles.physics import regeneration_limit
@@ -29,11 +29,11 @@ POWER = st.floats(0.0, 60e3)
     ],
 )
 def test_a_power_is_divided_by_the_wheel_s_speed_but_never_by_less_than_the_critical_slip_s(wheel, speed, expected):
-    assert conversion_speed_radps(wheel, speed, 0.2, CAR) == pytest.approx(expected)
+    assert conversion_speed_radps(wheel, speed, 0.2, RADIUS, 1.0) == pytest.approx(expected)
 
 
 def test_the_critical_slip_is_a_parameter():
-    assert conversion_speed_radps(0.0, 10.0, 0.5, CAR) == pytest.approx(5.0 / RADIUS)
+    assert conversion_speed_radps(0.0, 10.0, 0.5, RADIUS, 1.0) == pytest.approx(5.0 / RADIUS)
 
 
 @given(POWER, POWER, POWER, POWER)
@@ -61,7 +61,7 @@ def test_rounding_never_gives_an_axle_less_than_nothing():
 
 @given(st.floats(-400.0, 200.0), st.floats(0.0, 120.0), st.floats(0.0, 40.0), st.floats(0.0, 1.2))
 def test_motor_and_friction_brake_share_the_braking(torque, wheel, speed, heat):
-    motor, friction = blend(torque, wheel, speed, heat, CAR)
+    motor, friction = blend(torque, wheel, speed, heat, CAR.front.motor)
     if torque >= 0.0:
         assert (motor, friction) == (torque, 0.0)
         return
@@ -69,3 +69,17 @@ def test_motor_and_friction_brake_share_the_braking(torque, wheel, speed, heat):
     assert motor == pytest.approx(max(torque, -limit), abs=1e-9)
     assert friction <= 0.0
     assert motor + friction == pytest.approx(torque, abs=1e-9)
+
+
+@given(POWER, st.floats(1.0, 100.0), st.floats(1.0, 100.0), st.floats(0.0, 900.0), st.floats(0.0, 900.0), st.booleans())
+def test_the_wheels_of_an_axle_share_equally_until_one_has_no_room(power, left, right, room_left, room_right, even):
+    if even:
+        room_right = room_left
+    power = min(power, left * room_left + right * room_right)
+    torques = between_wheels(power, left, right, room_left, room_right)
+    assert torques[0] * left + torques[1] * right == pytest.approx(power, rel=1e-9, abs=1e-9)
+    for torque, room in zip(torques, (room_left, room_right), strict=True):
+        assert 0.0 <= torque <= room * (1.0 + 1e-9) + 1e-9
+    assert between_wheels(power, right, left, room_right, room_left)[::-1] == pytest.approx(torques, rel=1e-9, abs=1e-9)
+    if torques[0] != torques[1]:
+        assert min(torques) == min(room_left, room_right)

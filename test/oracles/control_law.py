@@ -1,4 +1,4 @@
-"""The control law in plain Python, axle by axle, as the rules are stated and not as the kernel computes them."""
+"""The control law in plain Python, wheel by wheel, as the rules are stated and not as the kernel computes them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from iwm_power_manager.control import types as t
-from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF
+from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, GATE_MODE_TABLE2
 from oracles.physics import regeneration_limit, slip, torque_limit
 from oracles.step import electrical_w
 
@@ -33,7 +33,7 @@ def slewed(before, target, dt, up, down, regeneration):
     return value
 
 
-def grip(braking, road, wheel, speed, settings, vehicle):
+def grip(braking, road, wheel, speed, settings, axle):
     """Torque that brings a wheel to the target slip within the limiter's time, against what the road takes."""
     if braking and speed < settings.slip_speed_floor_mps:
         return math.inf
@@ -41,23 +41,24 @@ def grip(braking, road, wheel, speed, settings, vehicle):
         rim = max(min(speed * (1.0 - settings.slip_target), speed - LEAST_SLIP_SPEED), 0.0)
     else:
         rim = max(speed / (1.0 - settings.slip_target), speed + LEAST_SLIP_SPEED)
-    change = (rim / vehicle.front.wheel.radius_m - wheel) / settings.slip_limiter_s
-    torque = road + vehicle.front.wheel.inertia_kgm2 * change
+    change = (rim / axle.wheel.radius_m - wheel) / settings.slip_limiter_s
+    torque = road + axle.wheel.inertia_kgm2 * change
     return max(-torque if braking else torque, 0.0)
 
 
-def battery_factor(torques, speeds, discharge, charge, motor):
+def battery_factor(torques, speeds, discharge, charge, motors):
     """Largest part of the torques inside the battery's limits, from the roots of the parabola the power is in it."""
-    if -charge <= sum(2.0 * electrical_w(x, w, motor) for x, w in zip(torques, speeds, strict=True)) <= discharge:
+    wheels = list(zip(torques, speeds, motors, strict=True))
+    if -charge <= sum(electrical_w(x, w, motor) for x, w, motor in wheels) <= discharge:
         return 1.0, ""
     square = linear = constant = 0.0
-    for x, w in zip(torques, speeds, strict=True):
+    for x, w, motor in wheels:
         if x == 0.0:
-            constant += 2.0 * electrical_w(0.0, w, motor)
+            constant += electrical_w(0.0, w, motor)
             continue
-        square += 2.0 * motor.loss_quadratic_torque * x * x
-        linear += 2.0 * (x * w + motor.loss_linear_torque * abs(x))
-        constant += 2.0 * (motor.loss_constant_w + motor.loss_linear_speed * w + motor.loss_quadratic_speed * w * w)
+        square += motor.loss_quadratic_torque * x * x
+        linear += x * w + motor.loss_linear_torque * abs(x)
+        constant += motor.loss_constant_w + motor.loss_linear_speed * w + motor.loss_quadratic_speed * w * w
     charging = square + linear + constant < -charge
     level = -charge if charging else discharge
     if charge == discharge == 0.0:
@@ -76,140 +77,178 @@ def battery_factor(torques, speeds, discharge, charge, motor):
 
 
 @dataclass
-class Axle:
-    """One axle in one step."""
+class Wheel:
+    """One wheel in one step."""
 
-    wheels: tuple[float, float]
-    motor_before: float
-    total_before: float
-    speed_before: float
-    road_before: float
-    slip_before: float
-    was_gated: bool
-    heat: float
+    speed: float
+    axle: object
+    before: t.WheelState
     gated: bool = False
     doubtful: bool = False  # so near to its edge that rounding decides
     slip: float = 0.0
     road: float = 0.0
-    asked: float = 0.0
     room: float = 0.0
     most: float = 0.0
     grip: float = math.inf
-    given: float = 0.0
     conversion: float = 0.0
     total: float = 0.0
     motor: float = 0.0
     friction: float = 0.0
 
     @property
-    def speed(self):
-        return 0.5 * sum(self.wheels)
+    def fast(self):
+        return max(self.speed, self.conversion)
+
+
+@dataclass
+class Pair:
+    """The wheels of one axle, and what they have together."""
+
+    wheels: list
+    unequal_s: float
+    budget: float
+    asked: float = 0.0
+    given: float = 0.0
 
     @property
-    def fast(self):
-        return max(*self.wheels, self.conversion)
+    def slip(self):
+        left, right = (wheel.slip for wheel in self.wheels)
+        return left if abs(left) > abs(right) else right
+
+    @property
+    def gated(self):
+        return all(wheel.gated for wheel in self.wheels)
+
+    @property
+    def capacity(self):
+        return sum(wheel.conversion * wheel.most for wheel in self.wheels)
 
 
 def step(m, state, settings, vehicle, decide):
     """Both axles, applied and decided share, limit bits; `decide` is the strategy, called with the two slips."""
-    motor, brake, radius = vehicle.front.motor, vehicle.front.friction_brake, vehicle.front.wheel.radius_m
-    wheels = m.wheel_speed_radps
     first = state.steps == 0
-    axles = [
-        Axle(
-            pair,
-            *(
-                getattr(state, f"{name}_{what}")
-                for what in ("motor_nm", "total_nm", "speed_radps", "road_nm", "slip", "gated", "heat")
-            ),
-        )
-        for name, pair in (("front", wheels[:2]), ("rear", wheels[2:]))
-    ]
     braking = m.power_demand_w < 0.0
     bits = set()
+    wheels = [
+        Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i])
+        for i, speed in enumerate(m.wheel_speed_radps)
+    ]
+    front, rear = axles = [
+        Pair(
+            wheels[k : k + 2],
+            getattr(state, f"{name}_unequal_s"),
+            getattr(settings, f"{name}_yaw_nm")
+            + getattr(settings, f"{name}_yaw_growth_nmps") * getattr(state, f"{name}_unequal_s"),
+        )
+        for k, name in ((0, "front"), (2, "rear"))
+    ]
 
-    for axle in axles:
-        slips = [slip(w, m.speed_mps, radius, settings.slip_speed_floor_mps) for w in axle.wheels]
-        worst = slips[0] if abs(slips[0]) > abs(slips[1]) else slips[1]
-        axle.slip = worst if first else low_pass(axle.slip_before, worst, m.dt_s, settings.slip_filter_s)
+    for wheel in wheels:
+        now = slip(wheel.speed, m.speed_mps, wheel.axle.wheel.radius_m, settings.slip_speed_floor_mps)
+        wheel.slip = now if first else low_pass(wheel.before.slip, now, m.dt_s, settings.slip_filter_s)
         if not first:
-            taken = axle.total_before - vehicle.front.wheel.inertia_kgm2 * (axle.speed - axle.speed_before) / m.dt_s
-            axle.road = low_pass(axle.road_before, taken, m.dt_s, settings.slip_filter_s)
+            change = (wheel.speed - wheel.before.speed_radps) / m.dt_s
+            taken = wheel.before.total_nm - wheel.axle.wheel.inertia_kgm2 * change
+            wheel.road = low_pass(wheel.before.road_nm, taken, m.dt_s, settings.slip_filter_s)
 
-    decided = state.decided_share
-    if first or state.decision_age_s + 1.5 * m.dt_s >= settings.decision_period_s:
-        decided = decide(axles[0].slip, axles[1].slip)
+    memory = state.split
+    decided = memory.decided_share
+    if first or memory.age_s + 1.5 * m.dt_s >= settings.decision_period_s:
+        decided = decide(front.slip, rear.slip)
     share = decided
     if not first:
         most = settings.share_rate_per_s * m.dt_s
-        share = state.applied_share + min(max(decided - state.applied_share, -most), most)
-
-    for axle in axles:
-        edge = settings.critical_slip - (settings.gate_hysteresis if axle.was_gated else 0.0)
-        axle.doubtful = abs(abs(axle.slip) - edge) < 1e-12
-        if settings.gate_mode != GATE_MODE_OFF and m.power_demand_w != 0.0:
-            spinning = settings.gate_driving and not braking and axle.slip > edge
-            axle.gated = spinning or (braking and -axle.slip > edge)
-    front, rear = axles
-    parts = {(False, False): (share, 1.0 - share), (True, False): (0.0, 1.0), (False, True): (1.0, 0.0)}
-    parts = parts.get((front.gated, rear.gated), (0.0, 0.0))
-    front.asked, rear.asked = (part * abs(m.power_demand_w) for part in parts)
+        share = memory.applied_share + min(max(decided - memory.applied_share, -most), most)
 
     floor = vehicle.driver.power_speed_floor_mps
     for axle in axles:
-        axle.conversion = max(axle.speed, max(m.speed_mps * (1.0 - settings.critical_slip), floor) / radius)
-        axle.room = brake.max_torque_nm if braking else torque_limit(axle.fast, axle.heat, motor)
-        if settings.gate_mode == GATE_MODE_LIMITER:
-            worst = min(axle.wheels) if braking else max(axle.wheels)
-            axle.grip = grip(braking, axle.road, worst, m.speed_mps, settings, vehicle)
-        axle.most = 0.0 if axle.gated else 2.0 * axle.conversion * min(axle.room, axle.grip)
-        axle.given = min(axle.asked, axle.most)
+        for wheel in axle.wheels:
+            own = axle.slip if settings.gate_mode == GATE_MODE_TABLE2 else wheel.slip
+            edge = settings.critical_slip - (settings.gate_hysteresis if wheel.before.gated else 0.0)
+            wheel.doubtful = abs(abs(own) - edge) < 1e-12
+            if settings.gate_mode != GATE_MODE_OFF and m.power_demand_w != 0.0:
+                spinning = settings.gate_driving and not braking and own > edge
+                wheel.gated = spinning or (braking and -own > edge)
+            held = max(m.speed_mps * (1.0 - settings.critical_slip), floor) / wheel.axle.wheel.radius_m
+            wheel.conversion = max(wheel.speed, held)
+            brake = wheel.axle.friction_brake.max_torque_nm
+            wheel.room = brake if braking else torque_limit(wheel.fast, wheel.before.heat, wheel.axle.motor)
+            if settings.gate_mode == GATE_MODE_LIMITER:
+                wheel.grip = grip(braking, wheel.road, wheel.speed, m.speed_mps, settings, wheel.axle)
+            wheel.most = 0.0 if wheel.gated else min(wheel.room, wheel.grip)
+        weaker = min(wheel.most for wheel in axle.wheels)
+        geometry = axle.wheels[0].axle
+        most = weaker + 2.0 * axle.budget * geometry.wheel.radius_m / geometry.track_width_m
+        for wheel in axle.wheels:
+            wheel.most = min(wheel.most, most)
+
+    parts = {(False, False): (share, 1.0 - share), (True, False): (0.0, 1.0), (False, True): (1.0, 0.0)}
+    parts = parts.get((front.gated, rear.gated), (0.0, 0.0))
+    front.asked, rear.asked = (part * abs(m.power_demand_w) for part in parts)
+    for axle in axles:
+        axle.given = min(axle.asked, axle.capacity)
     for axle in reversed(axles):
-        axle.given += max(min(front.asked + rear.asked - front.given - rear.given, axle.most - axle.given), 0.0)
+        axle.given += max(min(front.asked + rear.asked - front.given - rear.given, axle.capacity - axle.given), 0.0)
 
     missing = front.asked + rear.asked - front.given - rear.given
     for axle in axles:
-        if not axle.gated and max(missing, axle.asked - axle.given) > 1e-12 * abs(m.power_demand_w):
-            if axle.grip < axle.room:
-                bits.add(t.LIMIT_SLIP)
-            elif braking:
-                bits.add(t.LIMIT_FRICTION_BRAKE)
-            else:
-                bits.add(t.LIMIT_MOTOR)
-                if axle.room < torque_limit(axle.fast, 0.0, motor):
-                    bits.add(t.LIMIT_THERMAL)
-        axle.total = (-1.0 if braking else 1.0) * axle.given / (2.0 * axle.conversion)
-        weakest = regeneration_limit(axle.fast, m.speed_mps, axle.heat, motor)
-        wanted = max(axle.total, -weakest) if braking else axle.total
-        if wanted > axle.total:
-            bits.add(t.LIMIT_REGENERATION)
-        strongest = torque_limit(axle.fast, axle.heat, motor)
-        if braking:
-            weakest = min(weakest, axle.grip)
-        else:
-            strongest = min(strongest, axle.grip)
-        way = slewed(
-            axle.motor_before,
-            wanted,
-            m.dt_s,
-            settings.slew_up_nmps,
-            settings.slew_down_nmps,
-            settings.slew_regeneration_nmps,
-        )
-        axle.motor = 0.0 if axle.gated else min(max(way, -weakest), strongest)
-        if abs(axle.motor) <= NOTHING:
-            axle.motor = 0.0
-        if abs(axle.motor - wanted) > NOTHING:
-            bits.add(t.LIMIT_SLEW)
+        weak, strong = sorted(axle.wheels, key=lambda wheel: wheel.most)
+        equal = axle.given / (weak.conversion + strong.conversion)
+        low = min(equal, weak.most)
+        high = (axle.given - low * weak.conversion) / strong.conversion if low < equal else equal
+        weak.total, strong.total = (-low, -high) if braking else (low, high)
+        all_short = max(missing, axle.asked - axle.given) > 1e-12 * abs(m.power_demand_w)
+        for wheel in axle.wheels:
+            _torque(wheel, all_short or (wheel is weak and low < high), braking, m, settings, bits)
 
     factor, side = battery_factor(
-        [a.motor for a in axles], [a.speed for a in axles], m.discharge_limit_w, m.charge_limit_w, motor
+        [wheel.motor for wheel in wheels],
+        [wheel.speed for wheel in wheels],
+        m.discharge_limit_w,
+        m.charge_limit_w,
+        [wheel.axle.motor for wheel in wheels],
     )
     if side:
         bits.add(t.LIMIT_BATTERY_CHARGE if side == "charge" else t.LIMIT_BATTERY_DISCHARGE)
-    for axle in axles:
-        axle.motor *= factor
-        if braking and not axle.gated:
+    for wheel in wheels:
+        wheel.motor *= factor
+        if braking and not wheel.gated:
             # Whatever the motor does, wheel and brake together brake as asked.
-            axle.friction = -min(max(axle.motor - axle.total, 0.0), brake.max_torque_nm)
+            wheel.friction = -min(max(wheel.motor - wheel.total, 0.0), wheel.axle.friction_brake.max_torque_nm)
     return axles, share, decided, bits
+
+
+def _torque(wheel, short, braking, m, settings, bits):
+    """Motor torque of one wheel before the battery's limits."""
+    motor, heat = wheel.axle.motor, wheel.before.heat
+    if not wheel.gated and short:
+        if wheel.grip < wheel.room:
+            bits.add(t.LIMIT_SLIP)
+        elif braking:
+            bits.add(t.LIMIT_FRICTION_BRAKE)
+        else:
+            bits.add(t.LIMIT_MOTOR)
+            if wheel.room < torque_limit(wheel.fast, 0.0, motor):
+                bits.add(t.LIMIT_THERMAL)
+    weakest = regeneration_limit(wheel.fast, m.speed_mps, heat, motor)
+    wanted = max(wheel.total, -weakest) if braking else wheel.total
+    if wanted > wheel.total:
+        bits.add(t.LIMIT_REGENERATION)
+    strongest = torque_limit(wheel.fast, heat, motor)
+    if braking:
+        weakest = min(weakest, wheel.grip)
+    else:
+        strongest = min(strongest, wheel.grip)
+    way = slewed(
+        wheel.before.motor_nm,
+        wanted,
+        m.dt_s,
+        settings.slew_up_nmps,
+        settings.slew_down_nmps,
+        settings.slew_regeneration_nmps,
+    )
+    wheel.motor = 0.0 if wheel.gated else min(max(way, -weakest), strongest)
+    if abs(wheel.motor) <= NOTHING:
+        wheel.motor = 0.0
+    if abs(wheel.motor - wanted) > NOTHING:
+        bits.add(t.LIMIT_SLEW)
