@@ -14,24 +14,27 @@ export ROS_LOG_DIR ?= $(CURDIR)/log/ros
 
 ##@ The two commands
 .PHONY: demo test
-demo: setup-run  ## Drive the New York City Cycle over DDS, record it, show the result
+demo: setup-run  ## Drive the New York City Cycle over DDS, record it, show the result (2 min)
 	@$(BIN)/demo $(ARGS)
 
-test: lint type  ## Linters, types and all tests
+test: lint type  ## Linters, types and all tests (20 min)
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 ##@ Results
-.PHONY: policies study roads bench
+.PHONY: policies study docs-numbers roads bench
 CYCLES := $(foreach cycle,ftp75 hwfet nycc,--cycle config/cycles/$(cycle).csv)
-policies: setup-run  ## Solve the shipped policies again (the same tables come out)
+policies: setup-run  ## Solve the shipped policies again, the same tables come out (2 min)
 	@for idle in drag none; do $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml --idle-drive $$idle \
 	  $(CYCLES) --friction 0.9 0.5 0.2 --grid coupled --output policies $(ARGS) || exit $$?; done
 
-study: setup-run  ## All tables and figures of the paper, and what beats them
+study: setup-run  ## All tables and figures of the paper, and what beats them (half an hour)
 	@$(BIN)/evaluate --study runs/study $(ARGS)
 
 roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required
 	@$(BIN)/python -m iwm_sim.tools.roads --page docs/roads.md $(ARGS)
+
+docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (3 min)
+	@$(BIN)/python scripts/docs_numbers $(ARGS)
 
 bench: setup-dev  ## Time control path, bags and closed loop on this machine, each beside a peer
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit $$?; done
@@ -84,4 +87,4 @@ setup-dev:
 
 help:
 	@awk 'BEGIN {FS = ":.*## "} /^##@/ {printf "\n%s\n", substr($$0, 5)} \
-	  /^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' Makefile
+	  /^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' Makefile

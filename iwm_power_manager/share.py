@@ -6,6 +6,8 @@ ROS is needed to find them.
 
 from __future__ import annotations
 
+import contextlib
+import difflib
 import os
 import sys
 from pathlib import Path
@@ -13,6 +15,9 @@ from pathlib import Path
 from iwm_power_manager.errors import ConfigError
 
 PACKAGE = "iwm_power_manager"
+
+#: How much alike names have to be, 0..1, for one to be taken for a slip of the other.
+_NEAR = 0.75
 
 
 def roots() -> list[Path]:
@@ -53,7 +58,7 @@ def resolve(path: Path | str) -> Path:
     Raises
     ------
     ConfigError
-        If a name alone fits several files of the package.
+        If a name alone fits several files of the package, or none but is much like some.
     """
     given = Path(path).expanduser()
     if given.is_absolute() or given.exists():
@@ -67,10 +72,29 @@ def resolve(path: Path | str) -> Path:
             raise ConfigError(given, "", "fits several files of the package", names)
         if matches:
             return matches[0]
+    near = _near_names(given)
+    if near:
+        raise ConfigError(
+            given, "", "cannot be read: No such file or directory; did you mean " + " or ".join(near) + "?"
+        )
     return given
+
+
+def _near_names(given: Path) -> list[str]:
+    """Names of the package's files, and of those beside the one meant, that are spelled much like it."""
+    known = {path.name for root in roots() for path in _files(root)} if len(given.parts) == 1 else set()
+    with contextlib.suppress(OSError):
+        known |= {path.name for path in given.parent.iterdir()}
+    by_stem = {Path(name).stem: name for name in sorted(known)}
+    near = difflib.get_close_matches(given.stem, by_stem, n=3, cutoff=_NEAR)
+    return [str(given.with_name(by_stem[stem] if given.suffix else stem)) for stem in near]
+
+
+def _files(root: Path) -> list[Path]:
+    """Files below config/ and policies/."""
+    return [path for folder in ("config", "policies") for path in (root / folder).rglob("*") if path.is_file()]
 
 
 def _files_named(root: Path, name: str) -> list[Path]:
     """Files below config/ and policies/ that are called `name`, with or without their suffix."""
-    files = (path for folder in ("config", "policies") for path in (root / folder).rglob("*") if path.is_file())
-    return sorted(path for path in files if name in (path.name, path.stem))
+    return sorted(path for path in _files(root) if name in (path.name, path.stem))

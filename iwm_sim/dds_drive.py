@@ -118,7 +118,7 @@ def load(plan: Plan) -> Loaded:
         cycle,
         power_manager_config.law_settings(parameters, policies.strategy),
         table,
-        identity.get("checksum", "none needed"),
+        "none needed" if "checksum" not in identity else f"{identity['grid']} {identity['checksum'][:12]}",
     )
 
 

@@ -313,7 +313,8 @@ class Simulator(Node):
         timed_out = age_s > self._command_timeout_s
         if timed_out and not self._timed_out:
             self._timeouts += 1
-            self.get_logger().warning(f"no command for {age_s:.3f} s: motors off, brakes follow the pedal")
+            since = f"no command for {age_s:.3f} s" if min(self._received_ns) else "no command yet"
+            self.get_logger().warning(f"{since}: motors off, brakes follow the pedal")
         elif self._timed_out and not timed_out:
             self.get_logger().info("commands are back")
         self._timed_out = timed_out

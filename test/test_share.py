@@ -36,6 +36,20 @@ def test_a_path_that_is_nowhere_comes_back_as_given(path: str) -> None:
     assert share.resolve(path) == Path(path)
 
 
+@pytest.mark.parametrize(
+    ("given", "meant"), [("nyc", "nycc"), ("jalalmab_2015", "jalalmaab_2015"), ("my_car.yml", "my_car.yaml")]
+)
+def test_a_name_that_is_spelled_wrong_is_answered_with_what_was_meant(
+    given: str, meant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_car.yaml").touch()
+    with pytest.raises(
+        ConfigError, match=rf"^{given}: cannot be read: No such file or directory; did you mean.*{meant}"
+    ):
+        share.resolve(given)
+
+
 @pytest.mark.parametrize("name", ["nycc", "nycc.csv"])
 def test_a_file_of_the_package_is_found_by_its_name_alone(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -122,9 +122,10 @@ class Settings(NamedTuple):
     slew_regeneration_nmps: Annotated[
         float, Setting("fastest growth of a regenerative torque; friction fills in", "N m/s", 10.0, 1e6)
     ] = 4000.0
+    # At this price it changes the share about as often as sdp_lookahead does: its strongest rival at the same effort.
     switching_power_w: Annotated[
         float, Setting("instantaneous_slip: a change of the share has to save this much", "W", 0.0, 1e5)
-    ] = 100.0
+    ] = 60.0
     # The demand's Markov chain does not know how long a demand has lasted, so that the policy takes a passing one for
     # one that stays. Half of the power, sent back at once, is nine times as dear.
     reversal_price: Annotated[

@@ -62,6 +62,7 @@ class Policies:
         values = {"strategy": self.strategy, "policies": str(len(self._bank))}
         if self._chosen:
             values |= {
+                "grid": self._chosen.problem.name,
                 "friction": f"{self._chosen.friction:g}",
                 "checksum": self._chosen.checksum,
                 "vehicle": self._chosen.vehicle_name,

@@ -38,6 +38,7 @@ from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.demand import drive_source, read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
+from iwm_power_manager.tools.options import several
 from iwm_power_manager.tools.solver_figures import draw_solution
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
@@ -55,11 +56,11 @@ be within the grid's tolerance of the optimum; the table shows how it got there.
 _EXAMPLES = """\
 examples:
   The paper's problem, for a dry, a wet and an icy road, one file each:
-    solve_policy --vehicle jalalmaab_2015 --cycle ftp75 --cycle hwfet --cycle nycc \\
+    solve_policy --vehicle jalalmaab_2015 --cycle ftp75 hwfet nycc \\
                  --grid paper --friction 0.9 0.5 0.2 --output policies/
 
   From what your own car recorded, each second of it counting as much as ten of the cycle, with a picture:
-    solve_policy --vehicle my_car.yaml --cycle udds.csv --bag drive_1 --bag drive_2 --bag-weight 10 \\
+    solve_policy --vehicle my_car.yaml --cycle udds.csv --bag drive_1 drive_2 --bag-weight 10 \\
                  --mapping my_topics.yaml --friction 0.9 --output policies/ --plot solution.png
 
   Your own grid: copy config/grids/fine.yaml, edit it, and pass the file:
@@ -98,22 +99,18 @@ def parser() -> argparse.ArgumentParser:
     problem.add_argument("--discount", type=float, metavar="GAMMA", help="replaces the grid's discount")
 
     demand = result.add_argument_group("demand")
-    demand.add_argument(
-        "--cycle", action="append", default=[], metavar="CSV", help="time_s,speed_mps[,grade]; repeat for more"
-    )
+    demand.add_argument("--cycle", **several, metavar="CSV", help="time_s,speed_mps[,grade], one or more")
     demand.add_argument(
         "--bag",
-        action="append",
-        default=[],
+        **several,
         metavar="BAG",
-        help="rosbag2 recording with a power demand; repeat for more",
+        help="rosbag2 recording with a power demand",
     )
     demand.add_argument(
         "--transitions",
-        action="append",
-        default=[],
+        **several,
         metavar="NPZ",
-        help="demand counted by the power manager (its parameter demand_log); repeat for more",
+        help="demand counted by the power manager (its parameter demand_log)",
     )
     demand.add_argument("--mapping", metavar="YAML", help="topics and units of foreign bags (config/signals/)")
     demand.add_argument(

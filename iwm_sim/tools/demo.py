@@ -165,12 +165,19 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
     for line in table(rows):
         print(line)
     print()
+    print(made_with(plan, loaded))
     for remark in remarks:
         print(remark)
     if plan.record:
         print(f"bag:  {plan.output / 'bag'}")
     print(f"page: {plan.output / 'drive.html'}")
     return 0 if outcome.complete else 1
+
+
+def made_with(plan: Plan, loaded: Loaded) -> str:
+    """What the numbers depend on, in a line."""
+    law = f"control at {plan.rate_hz:g} Hz, split decided every {loaded.settings.decision_period_s:g} s"
+    return f"friction {plan.friction:g}, idle drive {loaded.vehicle.idle_drive}, {law}, policy {loaded.policy_identity}"
 
 
 def described(plan: Plan, loaded: Loaded, notes: Mapping[str, Any]) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from iwm_power_manager.policy import save_policy
 from iwm_power_manager.replay.demand import drive_source, read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import load_grid, targets
+from iwm_power_manager.tools.options import several
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.learning import (
     BANDWIDTHS,
@@ -64,7 +65,7 @@ change of the split a moment sooner or later.
 _EXAMPLES = """\
 examples:
   From two recorded drives, for a dry and a wet road:
-    learn_policy --vehicle my_car.yaml --bag drive_1 --bag drive_2 --friction 0.9 0.5 --output my_policies/
+    learn_policy --vehicle my_car.yaml --bag drive_1 drive_2 --friction 0.9 0.5 --output my_policies/
 
   Bags of another project; what they have to prove themselves on is a cycle:
     learn_policy --vehicle my_car.yaml --bag drive_1 --mapping my_topics.yaml --drive my_commute.csv \\
@@ -87,15 +88,15 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     result.add_argument("--vehicle", required=True, metavar="FILE", help="car, YAML (config/vehicles/)")
-    result.add_argument("--bag", action="append", required=True, metavar="BAG", help="recorded drive; repeat for more")
+    result.add_argument("--bag", **several, required=True, metavar="BAG", help="recorded drives")
     result.add_argument("--friction", nargs="+", type=float, required=True, metavar="MU", help="one policy each")
     result.add_argument("--output", required=True, metavar="DIR|FILE", help="folder, or a .npz file for a single one")
     result.add_argument("--mapping", metavar="YAML", help="topics and units of foreign bags (config/signals/)")
     result.add_argument(
-        "--cycle", action="append", metavar="CSV", help=f"cycles beside the bags (default: {', '.join(CYCLES)})"
+        "--cycle", **several, metavar="CSV", help=f"cycles beside the bags (default: {', '.join(CYCLES)})"
     )
     result.add_argument(
-        "--drive", action="append", metavar="CSV", help="cycles to prove themselves on (default: the recorded speed)"
+        "--drive", **several, metavar="CSV", help="cycles to prove themselves on (default: the recorded speed)"
     )
     result.add_argument(
         "--weights",
