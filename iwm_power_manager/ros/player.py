@@ -1,7 +1,8 @@
 """Play a bag to DDS, with /clock, so that the real nodes can be driven by a recorded drive.
 
 Time is the bag's: the log time, or, where a /clock was recorded, what that clock showed; so a lock-step drive, recorded
-much faster than real time, is played at the speed it was driven. The messages go out as the bytes they were recorded
+much faster than real time, is played at the speed it was driven, and one whose clock was set back in between goes on at
+its own pace. The messages go out as the bytes they were recorded
 in, under the quality of service their publishers had offered.
 """
 
@@ -21,7 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from iwm_power_manager.bags.reader import BagReader, Message
-from iwm_power_manager.errors import BagError
+from iwm_power_manager.errors import BagError, one_line
 from iwm_power_manager.replay.run import COMPUTED
 from iwm_power_manager.ros import ending
 from iwm_power_manager.ros.interruption import Interruption
@@ -94,10 +95,12 @@ class _Player:
         self._bag = bag
         self._options = options
         self._interruption = interruption
-        self._publishers = {name: _publisher(node, bag, name) for name in _chosen(bag, options.topics)}
+        self._publishers, problems = _publishers(node, bag, options.topics)
+        for line in problems:
+            print(f"replay: {line}", file=sys.stderr)
         self._clock = node.create_publisher(Clock, CLOCK, QoSProfile(depth=_DEPTH))
         self._sent = 0
-        self._late_s = 0.0
+        self._jumps: list[str] = []
 
     def wait_for_listeners(self) -> None:
         """Wait for the listeners that were asked for, else until somebody listens and no more listeners appear."""
@@ -119,26 +122,26 @@ class _Player:
 
     def pass_once(self) -> bool:
         """Play the chosen part once; False if there was nothing in it."""
-        begin_ns: int | None = None
-        first_ns = next_tick_ns = 0
+        first_ns: int | None = None
+        next_tick_ns = 0
         started_s = 0.0
         before = self._sent
-        for time_ns, message in _timeline(self._bag):
-            if begin_ns is None:
-                begin_ns = time_ns
-            offset_s = (time_ns - begin_ns) / _NS_PER_S
-            if offset_s < self._options.start_s:
+        for offset_ns, time_ns, message in paced(self._bag, self._jumps):
+            if offset_ns < self._options.start_s * _NS_PER_S:
                 continue
-            if self._options.end_s is not None and offset_s > self._options.end_s:
+            if self._options.end_s is not None and offset_ns > self._options.end_s * _NS_PER_S:
                 break
-            if not first_ns:
-                first_ns = next_tick_ns = time_ns
+            if first_ns is None:
+                first_ns = next_tick_ns = offset_ns
                 started_s = time.monotonic()
-            while next_tick_ns <= time_ns:
-                if not self._reach(next_tick_ns, first_ns, started_s, ticks=True):
+            while next_tick_ns <= offset_ns:
+                due_s = started_s + (next_tick_ns - first_ns) / _NS_PER_S / self._options.rate
+                if not self._reach(time_ns - offset_ns + next_tick_ns, due_s, ticks=True):
                     return False
                 next_tick_ns += _TICK_NS
-            if not self._reach(time_ns, first_ns, started_s, ticks=False):
+            if not self._reach(
+                time_ns, started_s + (offset_ns - first_ns) / _NS_PER_S / self._options.rate, ticks=False
+            ):
                 return False
             publisher = self._publishers.get(message.topic)
             if publisher is not None:
@@ -153,16 +156,18 @@ class _Player:
         for publisher in self._publishers.values():
             publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
         print(f"{self._bag.path}: {self._sent} messages of {len(self._publishers)} topics published")
+        for line in dict.fromkeys(self._jumps):
+            print(f"  {one_line(line)}")
         for line in self._bag.damage:
-            print(f"  damaged: {line}")
+            print(f"  damaged: {one_line(line)}")
 
-    def _reach(self, time_ns: int, first_ns: int, started_s: float, *, ticks: bool) -> bool:
-        """Let time come to `time_ns` and tell it; False if it is to stop."""
+    def _reach(self, time_ns: int, due_s: float, *, ticks: bool) -> bool:
+        """Wait until a time on the steady clock, and tell the bag's; False if it is to stop."""
         if self._options.step:
             if ticks and not sys.stdin.readline():
                 self._interruption.requested = True
         else:
-            wait_s = started_s + (time_ns - first_ns) / _NS_PER_S / self._options.rate - time.monotonic()
+            wait_s = due_s - time.monotonic()
             if wait_s > 0.0:
                 self._interruption.wait(wait_s)
         if self._interruption.requested:
@@ -184,14 +189,29 @@ def _chosen(bag: BagReader, topics: tuple[str, ...]) -> list[str]:
     return names
 
 
+def _publishers(node: Node, bag: BagReader, topics: tuple[str, ...]) -> tuple[dict[str, Any], list[str]]:
+    """A publisher for each chosen topic, and a line for each that cannot be played here."""
+    found: dict[str, Any] = {}
+    problems = []
+    for name in _chosen(bag, topics):
+        try:
+            found[name] = _publisher(node, bag, name)
+        except Exception as error:  # noqa: BLE001 - rclpy has several for names and types that are none
+            problems.append(one_line(f"{name} is left out: {error}", 300))
+    if not found:
+        raise BagError(f"{bag.path}: nothing can be played: {'; '.join(problems[:3]) or 'no topic'}")
+    return found, problems
+
+
 def _publisher(node: Node, bag: BagReader, name: str) -> Any:
     topic = bag.topics[name]
     package, _, rest = topic.type.partition("/")
-    kind, _, message = rest.partition("/")
+    if topic.serialization != "cdr":
+        raise BagError(f"its messages are {topic.serialization!r}, not CDR")
     try:
-        msg_class = getattr(importlib.import_module(f"{package}.{kind}"), message)
-    except (ImportError, AttributeError):
-        raise BagError(f"{name}: type {topic.type} is not installed here; choose others with --topics") from None
+        msg_class = getattr(importlib.import_module(f"{package}.msg"), rest.rpartition("/")[2])
+    except (ImportError, AttributeError, ValueError):
+        raise BagError(f"type {topic.type} is not installed here") from None
     reliable = not topic.qos or any(profile.reliability != "best_effort" for profile in topic.qos)
     latched = any(profile.durability == "transient_local" for profile in topic.qos)
     profile = QoSProfile(
@@ -201,6 +221,25 @@ def _publisher(node: Node, bag: BagReader, name: str) -> Any:
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )
     return node.create_publisher(msg_class, name, profile)
+
+
+def paced(bag: BagReader, jumps: list[str]) -> Iterator[tuple[int, int, Message]]:
+    """The bag's messages with the time since the first, in which no clock goes back, and the time of each.
+
+    A line for each time the recorded clock jumps back is added to `jumps`.
+    """
+    last_ns: int | None = None
+    offset_ns = 0
+    for time_ns, message in _timeline(bag):
+        if last_ns is not None and time_ns < last_ns:
+            jumps.append(
+                f"the recorded clock jumps back by {(last_ns - time_ns) / _NS_PER_S:.3f} s after "
+                f"{offset_ns / _NS_PER_S:.3f} s: played on at its own pace"
+            )
+        elif last_ns is not None:
+            offset_ns += time_ns - last_ns
+        last_ns = time_ns
+        yield offset_ns, time_ns, message
 
 
 def _timeline(bag: BagReader) -> Iterator[tuple[int, Message]]:
@@ -213,7 +252,7 @@ def _timeline(bag: BagReader) -> Iterator[tuple[int, Message]]:
     waiting: list[Message] = []
     now_ns: int | None = None
     for message in bag.messages():
-        if message.topic == CLOCK:
+        if message.topic == CLOCK and len(message.data) >= CLOCK_FIELDS_OFFSET + CLOCK_FIELDS.size:
             seconds, nanoseconds = CLOCK_FIELDS.unpack_from(message.data, CLOCK_FIELDS_OFFSET)
             now_ns = seconds * _NS_PER_S + nanoseconds
             for early in waiting:

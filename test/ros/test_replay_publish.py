@@ -13,10 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import foreign_bags as foreign
 from bags_helpers import ScriptedDrive
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.policy import load_policy, save_policy
 from iwm_power_manager.replay.run import FRICTION_COMMAND, MOTOR_COMMAND
+from iwm_power_manager.ros.player import paced
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.replay import DIFFERENT, DONE, main
 
@@ -187,3 +189,39 @@ def test_an_unknown_topic_is_named(tmp_path: Path, start: Callable[..., subproce
     _, error = player.communicate(timeout=PATIENCE_S)
     assert player.returncode == 2
     assert error.startswith(f"replay: {inputs}: holds no topic /nope; it holds /battery_state, ")
+
+
+def clocked(path: Path, clock_ns: Callable[[int], int], *more: foreign.Channel) -> Path:
+    """A bag of a drive with a /clock beside, and one message of each further channel."""
+    clock = foreign.Channel("/clock", "rosgraph_msgs/msg/Clock", "builtin_interfaces/Time clock\n")
+    entries = foreign.drive(10)
+    entries += [
+        (foreign.START_NS + i * foreign.PERIOD_NS - 500, 3, foreign.header(clock_ns(i))[:12]) for i in range(10)
+    ]
+    entries += [(foreign.START_NS + 5, 4 + i, b"\0\1\0\0") for i in range(len(more))]
+    return foreign.write_bag(path, sorted(entries), [*foreign.CHANNELS, clock, *more])
+
+
+def test_a_clock_that_jumps_back_is_played_on_at_its_own_pace_and_said(tmp_path: Path) -> None:
+    bag = clocked(tmp_path / "bag", lambda i: (50 + i % 5) * foreign.PERIOD_NS)
+    jumps: list[str] = []
+    with BagReader(bag) as reader:
+        found = [(offset, time) for offset, time, message in paced(reader, jumps) if message.topic == "/demand"]
+    pace = [0, 1, 2, 3, 4, 4, 5, 6, 7, 8]  # the time between the two drives is not known
+    assert [offset for offset, _ in found] == [i * foreign.PERIOD_NS for i in pace]
+    assert [time for _, time in found] == [(50 + i % 5) * foreign.PERIOD_NS for i in range(10)]
+    assert jumps == ["the recorded clock jumps back by 0.080 s after 0.080 s: played on at its own pace"]
+
+
+def test_a_topic_whose_type_is_not_installed_is_left_out_with_one_line_and_the_rest_is_played(
+    tmp_path: Path, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    lidar = foreign.Channel("/lidar", "vendor_msgs/msg/Packet", "uint8[] data\n")
+    bag = clocked(tmp_path / "bag", lambda i: i * foreign.PERIOD_NS, lidar, foreign.log_channel()[0])
+    out, error = end(start("tools.replay", str(bag), "--publish", "--rate", "1000"), None)
+    assert "20 messages of 2 topics published" in out
+    assert error.splitlines()[:3] == [
+        "replay: /car/speed is left out: type my_msgs/msg/Speed is not installed here",
+        "replay: /lidar is left out: type vendor_msgs/msg/Packet is not installed here",
+        "replay: /log is left out: its messages are 'json', not CDR",
+    ]
