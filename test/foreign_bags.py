@@ -117,7 +117,7 @@ def write_mcap(
                 writer.register_channel(channel.topic, channel.serialization, schema, {"key": channel.topic})
             )
         for sequence, (log_ns, number, data) in enumerate(entries, 1):
-            writer.add_message(numbers[number], log_ns, data, log_ns - 500, sequence)
+            writer.add_message(numbers[number], log_ns, data, max(log_ns - 500, 0), sequence)
         writer.finish()
     return path
 

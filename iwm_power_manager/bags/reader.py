@@ -7,6 +7,7 @@ as long as anything can be read. Nothing outside of the bag's folder is opened, 
 from __future__ import annotations
 
 import heapq
+import os
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -68,7 +69,7 @@ class BagReader:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        if not self.path.exists():
+        if not os.path.exists(self.path):
             raise BagError(f"{self.path}: does not exist")
         self._stack = ExitStack()
         self._damage: list[str] = []
@@ -188,7 +189,7 @@ class BagReader:
         content = self.information.get("relative_file_paths")
         listed = [self.path / PurePosixPath(str(name)).name for name in (content if isinstance(content, list) else [])]
         names = list(dict.fromkeys(name for name in listed if name != self.path))
-        present = [name for name in names if name.exists()]
+        present = [name for name in names if os.path.exists(name)]
         self._damage += [f"{name}: is missing" for name in names if name not in present]
         return present or data_files(self.path)
 

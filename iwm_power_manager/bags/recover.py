@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata
+from mcap.records import Attachment, Metadata
 
 from iwm_power_manager.bags.limits import ZSTD_MAGIC, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_file import McapFile
@@ -132,6 +132,7 @@ def recover(path: Path | str) -> Recovery:
         reports: list[FileRecovery] = []
         for name in _names(path):
             try:
+                regular_file(name, path if path.is_dir() else None)
                 files.append(_File(name, stack))
             except BagError as error:
                 reports.append(FileRecovery(name.name, False, 0, str(error)))
@@ -240,7 +241,6 @@ class _File:
         self.is_sqlite = path.name.removesuffix(COMPRESSED_SUFFIX).endswith(".db3")
         self.is_compressed = path.suffix == COMPRESSED_SUFFIX
         self._temporary: Path | None = None
-        regular_file(path)
         opened, problem = _opened(path, stack)
         self.seen = _Seen(open_source(opened, stack))
         self.problem = problem or "; ".join(self.seen.source.damage[:3])
@@ -355,9 +355,6 @@ class _Copy:
     def _announced(self, source: McapSource) -> dict[int, int]:
         """All channels with their schemas; the numbers they have in the new file."""
         definitions, channels = source.definitions, {}
-        for number in sorted(source.counts.keys() - definitions.channels.keys()):
-            # Its announcement is lost; what was sent on it is not.
-            definitions.channels[number] = Channel(number, f"/recovered/channel_{number}", "cdr", {}, 0)
         for number, channel in definitions.channels.items():
             schema = definitions.schema_of(channel)
             schema_id = self._file.schema_id(schema.name, schema.encoding, schema.data) if schema.id else 0
@@ -389,6 +386,8 @@ class _Copy:
 
     def _write(self, messages: Any) -> None:
         for log_time, channel, data, publish_time, sequence, _ in messages:
+            if channel not in self._channels:  # its announcement is lost; what was sent on it is not
+                self._channels[channel] = self._file.add_channel(f"/recovered/channel_{channel}", 0, {})
             self._file.write(self._channels[channel], log_time, publish_time, sequence, data)
 
 
