@@ -15,9 +15,7 @@ from hypothesis import HealthCheck, Phase, settings
 ROOT = Path(__file__).resolve().parents[1]
 
 # Continuous integration repeats the same examples: a change is judged by what it changes, not by luck.
-settings.register_profile(
-    "default", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=bool(os.environ.get("CI"))
-)
+settings.register_profile("default", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 settings.register_profile("nightly", settings.get_profile("default"), max_examples=20_000, derandomize=False)
 # A mutation run wants the first counterexample at once, not the smallest one.
 settings.register_profile(

@@ -23,6 +23,8 @@ from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.errors import BagError
 
 GIBIBYTE = 1024**3
+#: For each of five kinds of files: 500 in all, and 20,000 in the nightly run.
+EXAMPLES = min(settings().max_examples, 4000)
 
 
 def written(chunk: Chunk) -> bytes:
@@ -249,7 +251,7 @@ def mutations(draw: st.DrawFn) -> Callable[[bytes], bytes]:
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".lz4.mcap", ".mcap.zstd", ".db3", "metadata.yaml"])
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=EXAMPLES)
 @given(mutate=mutations())
 @example(mutate=lambda content: content[: len(content) // 2] + bytes(16) + content[len(content) // 2 :])
 @example(mutate=lambda _: MAGIC)
