@@ -202,7 +202,10 @@ class BagReader:
             problem = decompress_file(path, opened)
             if problem:
                 self._damage.append(f"{path}: {problem}")
-        return open_source(opened, self._stack)
+        try:
+            return open_source(opened, self._stack)
+        except BagError as error:  # not under the name of a copy
+            raise BagError(str(error).replace(str(opened), str(path))) from None
 
 
 def open_source(path: Path, stack: ExitStack, suffix: str = "") -> Source:

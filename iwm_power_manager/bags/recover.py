@@ -242,7 +242,10 @@ class _File:
         self.is_compressed = path.suffix == COMPRESSED_SUFFIX
         self._temporary: Path | None = None
         opened, problem = _opened(path, stack)
-        self.seen = _Seen(open_source(opened, stack))
+        try:
+            self.seen = _Seen(open_source(opened, stack))
+        except BagError as error:  # not under the name of a copy
+            raise BagError(str(error).replace(str(opened), str(path))) from None
         self.problem = problem or "; ".join(self.seen.source.damage[:3])
         self.report = FileRecovery(path.name, False, self.seen.count, "")
 

@@ -1,0 +1,228 @@
+"""Recovery of other recorders' bags: everything that was readable is there afterwards, as it was."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+import zstandard
+from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.writer import Writer
+from rosbags.rosbag2 import Reader as RosbagsReader
+
+import foreign_bags as foreign
+from iwm_power_manager.bags.reader import BagReader, Message
+from iwm_power_manager.bags.recover import recover
+
+CHANNELS = [
+    foreign.SPEED._replace(text=foreign.IDL_TEXT, encoding="ros2idl"),
+    foreign.DEMAND,
+    foreign.JOINTS,
+    foreign.log_channel()[0],
+]
+
+
+def entries() -> list[foreign.Entry]:
+    found = foreign.drive(60)
+    return sorted(found + [(t + 3, 3, foreign.log_channel()[1]) for t, n, _ in found if n == 0])
+
+
+def extras(writer: Writer) -> None:
+    writer.add_metadata("rosbag2", {"serialized_metadata": "version: 8\n", "ROS_DISTRO": "humble"})
+    writer.add_metadata("trip", {"driver": "A. Example"})
+    writer.add_attachment(7, 8, "calib.txt", "text/plain", b"wheel 0.3")
+
+
+def messages(path: Path) -> list[Message]:
+    with BagReader(path) as reader:
+        return list(reader.messages())
+
+
+def information(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load((folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    return found
+
+
+def torn(folder: Path, **options: Any) -> Path:
+    """A bag's folder with a file that ends in a chunk, without metadata."""
+    path = foreign.write_mcap(folder / "a_0.mcap", entries(), CHANNELS, chunk_bytes=2000, extras=extras, **options)
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) * 6 // 10])
+    return folder
+
+
+def test_schemas_attachments_metadata_and_messages_of_a_torn_file_are_carried_over(tmp_path: Path) -> None:
+    folder = torn(tmp_path / "bag")
+    before, original = messages(folder), (folder / "a_0.mcap").read_bytes()
+    report = recover(folder)
+    assert messages(folder) == before
+    assert len(before) > 100
+    with (folder / "a_0.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert reader.get_header().library == "foreign"
+        assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [
+            ("rosbag2", {"serialized_metadata": "version: 8\n", "ROS_DISTRO": "humble"}),
+            ("trip", {"driver": "A. Example"}),
+        ]
+        (attachment,) = reader.iter_attachments()
+        assert (attachment.name, attachment.log_time, attachment.data) == ("calib.txt", 8, b"wheel 0.3")
+        by_topic = {channel.topic: channel for channel in summary.channels.values()}
+        for channel in CHANNELS:
+            found = by_topic[channel.topic]
+            schema = summary.schemas[found.schema_id]
+            assert (schema.name, schema.encoding, schema.data) == (
+                channel.type,
+                channel.encoding,
+                channel.text.encode(),
+            )
+            assert (found.message_encoding, found.metadata) == (channel.serialization, {"key": channel.topic})
+    assert information(folder)["ros_distro"] == "humble"
+    assert report.missing == {}  # other recorders count something else
+    assert report.files[0].discarded_bytes > 0
+    assert (folder / "a_0.mcap.damaged").read_bytes() == original  # a torn chunk is not carried over
+
+
+def test_a_torn_file_of_compressed_messages_keeps_them_and_they_can_be_decoded(tmp_path: Path) -> None:
+    packed = [(t, n, zstandard.compress(data)) for t, n, data in foreign.drive(60)]
+    folder = foreign.write_bag(tmp_path / "bag", packed, chunk_bytes=2000)
+    foreign.write_metadata(folder, compression_format="zstd", compression_mode="MESSAGE", ros_distro="iron")
+    path = folder / "a_0.mcap"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
+    before = messages(folder)
+    recover(folder)
+    assert messages(folder) == before
+    found = information(folder)
+    assert (found["compression_mode"], found["compression_format"], found["ros_distro"]) == ("MESSAGE", "zstd", "iron")
+    with RosbagsReader(folder) as reader:
+        assert [data for _, _, data in reader.messages()] == [message.data for message in before]
+
+
+@pytest.mark.parametrize("single", [True, False], ids=["file", "folder"])
+@pytest.mark.parametrize("whole", [True, False], ids=["whole", "torn"])
+def test_a_compressed_file_becomes_one_beside_it(tmp_path: Path, single: bool, whole: bool) -> None:
+    folder = tmp_path / "bag"
+    # More than one block of zstd, so that half of it is something.
+    path = foreign.write_mcap(folder / "a_0.mcap", foreign.drive(2000), chunk_bytes=2000, compression="none")
+    packed = folder / "a_0.mcap.zstd"
+    content = zstandard.compress(path.read_bytes())
+    packed.write_bytes(content if whole else content[: len(content) // 2])
+    path.unlink()
+    before, original = messages(packed), packed.read_bytes()
+    report = recover(packed if single else folder)
+    assert report.files[0].kept == "a_0.mcap.zstd"
+    assert packed.read_bytes() == original
+    assert messages(path) == before
+    assert len(before) > 50
+    if not single:
+        assert messages(folder) == before
+        assert recover(folder).lines()[-1] == "  nothing to recover"
+
+
+@pytest.mark.parametrize("single", [True, False], ids=["file", "folder"])
+def test_a_damaged_sqlite_file_becomes_an_mcap_file_beside_it(tmp_path: Path, single: bool) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(400))
+    database = folder / "a_0.db3"
+    database.write_bytes(database.read_bytes()[: database.stat().st_size // 2])
+    before, original = messages(folder), database.read_bytes()
+    report = recover(database if single else folder)
+    assert (report.files[0].rebuilt, report.files[0].kept) == (True, "a_0.db3")
+    assert database.read_bytes() == original
+    assert messages(folder / "a_0.mcap") == before
+    assert len(before) > 200
+    if not single:
+        assert information(folder)["storage_identifier"] == "mcap"
+        assert messages(folder) == before
+
+
+def test_what_stands_in_the_journal_of_a_killed_recorder_is_recovered(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(10))
+    database = sqlite3.connect(folder / "a_0.db3")
+    database.execute("PRAGMA journal_mode = WAL")
+    database.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, 5, x'0001000000000000000000f03f')")
+    database.commit()
+    copy = tmp_path / "killed"
+    copy.mkdir()
+    for path in folder.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    database.close()
+    assert (copy / "a_0.db3-wal").stat().st_size > 0
+    recover(copy)
+    assert len(messages(copy)) == 31
+    assert (copy / "a_0.db3-wal").exists()
+
+
+def test_a_whole_sqlite_file_without_metadata_gets_metadata_of_its_own_kind(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(10))
+    (folder / "metadata.yaml").unlink()
+    report = recover(folder)
+    assert (report.metadata_written, report.files[0].rebuilt) == (True, False)
+    assert information(folder)["storage_identifier"] == "sqlite3"
+    assert len(messages(folder)) == 30
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"topics_with_message_count": [{"topic_metadata": {"name": "/a"}, "message_count": None}]},
+        {"custom_data": "x"},
+        {"message_count": "many"},
+        {"duration": 7},
+        {"relative_file_paths": [3]},
+    ],
+)
+def test_metadata_of_the_wrong_kind_is_damage_and_the_data_is_read(tmp_path: Path, changes: dict[str, Any]) -> None:
+    folder = foreign.write_bag(tmp_path / "bag", foreign.drive(10))
+    foreign.write_metadata(folder, **changes)
+    with BagReader(folder) as reader:
+        assert sum(1 for _ in reader.messages()) == 30
+        assert any("metadata.yaml: " in line for line in reader.damage)
+    assert recover(folder).metadata_written
+    with BagReader(folder) as reader:
+        assert reader.damage == []
+
+
+def test_an_empty_chunk_has_no_say_in_when_a_bag_begins(tmp_path: Path) -> None:
+    folder = foreign.write_bag(tmp_path / "bag", foreign.drive(10), chunk_bytes=500)
+    path = folder / "a_0.mcap"
+    content = path.read_bytes()
+    at = content.index(b"\x0f\x04\0\0\0\0\0\0\0")
+    from mcap.data_stream import RecordBuilder
+
+    builder = RecordBuilder()
+    Chunk("", b"", 0, 0, 0, 0).write(builder)
+    path.write_bytes(content[:at] + builder.end())
+    report = recover(folder)
+    assert (report.start_ns, report.files[0].message_count) == (foreign.START_NS, 30)
+    with BagReader(folder) as reader:
+        assert (reader.start_ns, reader.damage) == (foreign.START_NS, [])
+
+
+def test_a_record_nobody_knows_is_carried_over_as_it_is(tmp_path: Path) -> None:
+    path = foreign.write_mcap(tmp_path / "a.mcap", foreign.drive(10))
+    content = path.read_bytes()
+    at = content.index(b"\x0f\x04\0\0\0\0\0\0\0")
+    private = b"\x90\x05\0\0\0\0\0\0\0hello"
+    path.write_bytes(content[:at] + private + b"\0" * 5)
+    recover(path)
+    assert private in path.read_bytes()
+    assert len(messages(path)) == 30
+
+
+def test_behind_a_stretch_that_a_power_cut_has_left_empty_reading_goes_on(tmp_path: Path) -> None:
+    folder = foreign.write_bag(tmp_path / "bag", foreign.drive(100), chunk_bytes=1000)
+    path = folder / "a_0.mcap"
+    content = bytearray(path.read_bytes()[:-40])
+    content[len(content) // 3 : len(content) // 3 + 600] = bytes(600)
+    path.write_bytes(bytes(content))
+    report = recover(folder)
+    assert report.files[0].lost_chunks > 0
+    found = messages(folder)
+    assert 200 < len(found) < 300
+    assert {message.data for message in found} <= {data for _, _, data in foreign.drive(100)}
+    assert (folder / "a_0.mcap.damaged").read_bytes() == bytes(content)
