@@ -1,0 +1,200 @@
+"""Motors that do not do what they are told: commanded against reported torque, motor by motor.
+
+A report is late by up to `lag_s`, so it is held against all commands of that time: it has to lie between the least and
+the largest of them, give or take a tolerance. A motor whose reports lie outside for `confirm_s` is judged by the ratio
+of reported to commanded torque over that time: dead, weak, reversed, or stuck where the report does not follow at all.
+The torque the law may count on is `gain` times what it commands; a motor that does not follow is switched off.
+
+Reports are only judged once some motor has been seen to follow its commands: a car that fills the field with zeros does
+not report. What was found stays until the next activation, except a weak motor that follows again for `recover_s`.
+
+Pure functions over numbers; one call a step for each motor.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from typing import NamedTuple
+
+from iwm_power_manager.control.types import Wheels
+
+
+class MotorVerdict(enum.IntEnum):
+    """What became of a motor's torque."""
+
+    GOOD = 0
+    WEAK = 1  # follows, with a part of the torque
+    DEAD = 2
+    STUCK = 3  # a torque of its own, whatever is commanded
+    REVERSED = 4
+
+
+class ActuatorLimits(NamedTuple):
+    """What is believed of a reported torque.
+
+    Attributes
+    ----------
+    tolerance_nm : error that is always believed, N m > 0
+    tolerance_ratio : and as part of the torque, >= 0
+    lag_s : a report may belong to any command of this time
+    confirm_s : how long reports have to be outside before a motor is judged
+    recover_s : how long a weak motor has to follow before it counts as good again
+    """
+
+    tolerance_nm: float
+    tolerance_ratio: float
+    lag_s: float
+    confirm_s: float
+    recover_s: float
+
+
+class Evidence(NamedTuple):
+    """What is remembered of one motor.
+
+    Attributes
+    ----------
+    verdict, gain : as found; gain is the part of a commanded torque that arrives, 0 for a motor that is switched off
+    outside_s, inside_s : how long the reports have been outside, or inside while there was a torque to judge
+    product, square : sums of commanded times reported and of commanded squared torque while outside, (N m)2
+    least_nm, most_nm : of the reports while outside
+    commanded_least_nm, commanded_most_nm : of the commands while outside
+    """
+
+    verdict: MotorVerdict = MotorVerdict.GOOD
+    gain: float = 1.0
+    outside_s: float = 0.0
+    inside_s: float = 0.0
+    product: float = 0.0
+    square: float = 0.0
+    least_nm: float = math.inf
+    most_nm: float = -math.inf
+    commanded_least_nm: float = math.inf
+    commanded_most_nm: float = -math.inf
+
+
+class Commanded(NamedTuple):
+    """One command that was sent: how long ago, and its motor torques."""
+
+    age_s: float
+    torque_nm: Wheels
+
+
+class ActuatorState(NamedTuple):
+    """What is remembered of all motors.
+
+    Attributes
+    ----------
+    motors : in the order of the wheels
+    recent : commands of the last `lag_s`, the newest last
+    reporting : some motor has been seen to follow its commands
+    """
+
+    motors: tuple[Evidence, Evidence, Evidence, Evidence] = (Evidence(),) * 4
+    recent: tuple[Commanded, ...] = ()
+    reporting: bool = False
+
+    @property
+    def gains(self) -> Wheels:
+        """Part of a commanded torque that arrives, motor by motor."""
+        a, b, c, d = self.motors
+        return (a.gain, b.gain, c.gain, d.gain)
+
+
+#: Ratio of reported to commanded torque below which a motor is dead, and below whose negative it is reversed.
+DEAD_RATIO = 0.2
+
+
+def commanded(state: ActuatorState, torque_nm: Wheels, dt_s: float, limits: ActuatorLimits) -> ActuatorState:
+    """Remember a command that was sent, `dt_s` after the one before."""
+    aged = (Commanded(sent.age_s + dt_s, sent.torque_nm) for sent in state.recent)
+    kept = tuple(sent for sent in aged if sent.age_s <= limits.lag_s)
+    return state._replace(recent=(*kept, Commanded(0.0, torque_nm)))
+
+
+def judge(state: ActuatorState, reported_nm: Wheels, dt_s: float, limits: ActuatorLimits) -> ActuatorState:
+    """Hold the latest reports against the commands they can belong to.
+
+    Parameters
+    ----------
+    state : what is remembered
+    reported_nm : motor torques, driving positive; NaN: not reported
+    dt_s : time since the previous reports, > 0
+    limits : what is believed
+    """
+    if not state.recent:
+        return state
+    ranges = [(min(torques), max(torques)) for torques in zip(*(c.torque_nm for c in state.recent), strict=True)]
+    reporting = state.reporting or any(
+        _follows(reported, *between, limits) for reported, between in zip(reported_nm, ranges, strict=True)
+    )
+    motors = state.motors
+    if reporting:
+        a, b, c, d = (
+            _judged(motor, reported, *between, dt_s, limits)
+            for motor, reported, between in zip(motors, reported_nm, ranges, strict=True)
+        )
+        motors = (a, b, c, d)
+    return state._replace(motors=motors, reporting=reporting)
+
+
+def _tolerance_nm(least_nm: float, most_nm: float, limits: ActuatorLimits) -> float:
+    return limits.tolerance_nm + limits.tolerance_ratio * max(abs(least_nm), abs(most_nm))
+
+
+def _follows(reported_nm: float, least_nm: float, most_nm: float, limits: ActuatorLimits) -> bool:
+    """Whether a report can only come from a motor that follows: a torque that is clearly there, and as commanded."""
+    tolerance = _tolerance_nm(least_nm, most_nm, limits)
+    clear = min(abs(least_nm), abs(most_nm)) > 2.0 * tolerance and least_nm * most_nm > 0.0
+    return clear and least_nm - tolerance <= reported_nm <= most_nm + tolerance
+
+
+def _judged(
+    motor: Evidence, reported_nm: float, least_nm: float, most_nm: float, dt_s: float, limits: ActuatorLimits
+) -> Evidence:
+    if math.isnan(reported_nm) or motor.verdict not in (MotorVerdict.GOOD, MotorVerdict.WEAK):
+        return motor
+    tolerance = _tolerance_nm(least_nm, most_nm, limits)
+    if least_nm - tolerance <= reported_nm <= most_nm + tolerance:
+        return _inside(motor, max(abs(least_nm), abs(most_nm)) > 2.0 * tolerance, dt_s, limits)
+    nearest = min(max(reported_nm, least_nm), most_nm)
+    motor = motor._replace(
+        outside_s=motor.outside_s + dt_s,
+        inside_s=0.0,
+        product=motor.product + nearest * reported_nm,
+        square=motor.square + nearest * nearest,
+        least_nm=min(motor.least_nm, reported_nm),
+        most_nm=max(motor.most_nm, reported_nm),
+        commanded_least_nm=min(motor.commanded_least_nm, nearest),
+        commanded_most_nm=max(motor.commanded_most_nm, nearest),
+    )
+    if motor.outside_s < limits.confirm_s - 0.5 * dt_s:
+        return motor
+    verdict, gain = _verdict(motor, limits)
+    return Evidence(verdict=verdict, gain=gain)
+
+
+def _inside(motor: Evidence, clear: bool, dt_s: float, limits: ActuatorLimits) -> Evidence:
+    """Evidence fades at the pace at which it came: a fault that flickers is found, too, if it is there more often."""
+    inside_s = motor.inside_s + dt_s if clear else motor.inside_s
+    outside_s = max(motor.outside_s - dt_s, 0.0)
+    if outside_s == 0.0:
+        motor = Evidence(verdict=motor.verdict, gain=motor.gain)
+    if motor.verdict is MotorVerdict.WEAK and inside_s >= limits.recover_s:
+        return Evidence()
+    return motor._replace(outside_s=outside_s, inside_s=inside_s)
+
+
+def _verdict(motor: Evidence, limits: ActuatorLimits) -> tuple[MotorVerdict, float]:
+    """What a motor whose reports were outside long enough is, and the part of its torque to count on."""
+    ratio = motor.product / motor.square if motor.square > 0.0 else math.inf
+    still = motor.most_nm - motor.least_nm <= limits.tolerance_nm
+    moved = motor.commanded_most_nm - motor.commanded_least_nm > 2.0 * limits.tolerance_nm
+    silent = max(abs(motor.most_nm), abs(motor.least_nm)) <= limits.tolerance_nm
+    if silent or abs(ratio) < DEAD_RATIO:
+        return MotorVerdict.DEAD, 0.0
+    if (still and moved) or ratio > 1.0:
+        return MotorVerdict.STUCK, 0.0
+    if ratio < 0.0:
+        return MotorVerdict.REVERSED, 0.0
+    return MotorVerdict.WEAK, min(ratio, 1.0)

@@ -1,0 +1,133 @@
+"""Motors held against their commands: what is found, how soon, and what is never called a fault."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iwm_power_manager.control.actuators import (
+    ActuatorLimits,
+    ActuatorState,
+    MotorVerdict,
+    commanded,
+    judge,
+)
+
+LIMITS = ActuatorLimits(tolerance_nm=6.0, tolerance_ratio=0.1, lag_s=0.05, confirm_s=0.1, recover_s=2.0)
+DT = 0.01
+
+
+def drive(state, commands, reports):
+    """Command and report step by step; the state after each step."""
+    states = []
+    for torque, report in zip(commands, reports, strict=True):
+        state = commanded(state, tuple(torque), DT, LIMITS)
+        state = judge(state, tuple(report), DT, LIMITS)
+        states.append(state)
+    return states
+
+
+def steady(torque, steps=60):
+    return [(torque,) * 4] * steps
+
+
+def following(torque=60.0):
+    """A car whose motors have been seen to follow."""
+    return drive(ActuatorState(), steady(torque), steady(torque))[-1]
+
+
+def first_found(states, wheel):
+    return next((i for i, state in enumerate(states) if state.motors[wheel].verdict is not MotorVerdict.GOOD), None)
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("torque", [-70.0, -25.0, 25.0, 60.0, 180.0])
+@pytest.mark.parametrize(
+    ("factor", "verdict"), [(0.0, MotorVerdict.DEAD), (0.5, MotorVerdict.WEAK), (-1.0, MotorVerdict.REVERSED)]
+)
+def test_a_motor_that_fails_is_found_within_a_fifth_of_a_second_and_named(wheel, torque, factor, verdict):
+    report = [torque] * 4
+    report[wheel] = factor * torque
+    states = drive(following(torque), steady(torque), [report] * 60)
+    found = first_found(states, wheel)
+    assert (found + 1) * DT <= 0.2
+    assert states[-1].motors[wheel].verdict is verdict
+    assert states[-1].gains[wheel] == pytest.approx(max(factor, 0.0))
+    assert all(states[-1].gains[other] == 1.0 for other in range(4) if other != wheel)
+
+
+@pytest.mark.parametrize("wheel", range(4))
+def test_a_torque_that_nobody_asked_for_is_a_stuck_motor(wheel):
+    report = [0.0] * 4
+    report[wheel] = 60.0
+    state = drive(following(), steady(0.0), [report] * 60)[-1]
+    assert (state.motors[wheel].verdict, state.gains[wheel]) == (MotorVerdict.STUCK, 0.0)
+
+
+def test_a_motor_that_keeps_its_torque_while_the_command_moves_is_stuck():
+    commands = [(60.0 + 2.0 * i,) * 4 for i in range(50)]
+    reports = [(60.0, *torque[1:]) for torque in commands]
+    state = drive(following(), commands, reports)[-1]
+    assert state.motors[0].verdict is MotorVerdict.STUCK
+
+
+@given(
+    st.lists(st.floats(-80.0, 200.0), min_size=20, max_size=60),
+    st.integers(0, 5),
+    st.lists(st.floats(-5.0, 5.0), min_size=60, max_size=60),
+)
+def test_no_motor_that_follows_late_and_with_noise_is_ever_suspected(torques, lag, noise):
+    commands = [(torque,) * 4 for torque in torques]
+    late = [torques[max(i - lag, 0)] + noise[i] for i in range(len(torques))]
+    state = following()
+    state = commanded(state, commands[0], LIMITS.lag_s + DT, LIMITS)
+    for after in drive(state, commands, [(value,) * 4 for value in late]):
+        assert all(motor.verdict is MotorVerdict.GOOD and motor.gain == 1.0 for motor in after.motors)
+
+
+def test_zeros_from_a_car_that_does_not_report_are_no_fault():
+    state = drive(ActuatorState(), steady(100.0, 500), steady(0.0, 500))[-1]
+    assert not state.reporting
+    assert state.gains == (1.0,) * 4
+
+
+def test_a_motor_dead_from_the_start_is_found_as_soon_as_another_follows():
+    states = drive(ActuatorState(), steady(60.0), [(0.0, 60.0, 60.0, 60.0)] * 60)
+    assert states[-1].motors[0].verdict is MotorVerdict.DEAD
+
+
+@pytest.mark.parametrize("torque", [0.0, 60.0])
+def test_what_is_not_reported_is_not_judged(torque):
+    state = drive(following(), steady(torque), [(math.nan,) * 4] * 60)[-1]
+    assert state.gains == (1.0,) * 4
+
+
+def test_nothing_is_judged_before_a_command_was_sent():
+    assert judge(ActuatorState(), (50.0,) * 4, DT, LIMITS) == ActuatorState()
+
+
+def test_a_weak_motor_that_follows_again_is_believed_after_a_while_and_a_dead_one_is_not():
+    weak = drive(following(), steady(60.0), [(30.0, 60.0, 60.0, 60.0)] * 60)[-1]
+    assert weak.motors[0].verdict is MotorVerdict.WEAK
+    steps = round(LIMITS.recover_s / DT)
+    states = drive(weak, steady(60.0, steps + 1), steady(60.0, steps + 1))
+    assert states[steps // 2].motors[0].verdict is MotorVerdict.WEAK
+    assert states[-1].motors[0].verdict is MotorVerdict.GOOD
+    dead = drive(following(), steady(60.0), [(0.0, 60.0, 60.0, 60.0)] * 60)[-1]
+    assert drive(dead, steady(60.0, 500), steady(60.0, 500))[-1].motors[0].verdict is MotorVerdict.DEAD
+
+
+def test_one_report_gone_wrong_is_forgotten():
+    reports = [(60.0,) * 4] * 5 + [(0.0, 60.0, 60.0, 60.0)] * 5 + [(60.0,) * 4] * 50
+    state = drive(following(), steady(60.0), reports)[-1]
+    assert state.motors[0] == state.motors[1]._replace(inside_s=state.motors[0].inside_s)
+    assert state.gains == (1.0,) * 4
+
+
+@given(st.lists(st.tuples(*[st.floats(-300.0, 300.0)] * 4), min_size=1, max_size=40))
+def test_a_gain_is_a_part_whatever_is_reported(reports):
+    for state in drive(following(), steady(60.0, len(reports)), reports):
+        assert all(0.0 <= gain <= 1.0 for gain in state.gains)
