@@ -2,7 +2,8 @@
 
 A file has the columns `time_s,speed_mps` and optionally `grade` (rise over run, uphill positive), in any order, after
 one header line. Steps may be uneven and may have gaps: between two points, speed and grade change linearly with time.
-Empty lines and lines that start with # are skipped.
+Empty lines and lines that start with # are skipped. A file whose accelerations no car has is refused with the unit it
+probably holds; `import_cycle` makes a cycle of a log in other units, with gaps or noise.
 """
 
 from __future__ import annotations
@@ -16,13 +17,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from iwm_power_manager import trace_units
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import read_text, sha256_of
+from iwm_power_manager.files import MAX_LINE_LENGTH, read_text, sha256_of, to_number
 
 MAX_SPEED_MPS = 70.0
 MAX_GRADE = 0.5
 #: Two days at 10 Hz: beyond that, the time column is not in seconds.
 MAX_SAMPLES = 2_000_000
+
+#: A sensor at rest shows as little as this below zero: rest.
+REST_NOISE_MPS = 0.05
 
 _REQUIRED = ("time_s", "speed_mps")
 _RANGES = {"speed_mps": (0.0, MAX_SPEED_MPS), "grade": (-MAX_GRADE, MAX_GRADE)}
@@ -93,7 +98,7 @@ class Cycle:
 def make_cycle(name: str, time_s, speed_mps, grade=None) -> Cycle:
     """A `Cycle` from arrays, with the same checks as a file's."""
     time = np.ascontiguousarray(time_s, dtype=np.float64)
-    speed = np.ascontiguousarray(speed_mps, dtype=np.float64)
+    speed = at_rest(np.ascontiguousarray(speed_mps, dtype=np.float64))
     slope = np.zeros_like(time) if grade is None else np.ascontiguousarray(grade, dtype=np.float64)
     if not (time.ndim == 1 and time.shape == speed.shape == slope.shape):
         raise ConfigError(name, "", f"columns of different lengths: {time.shape}, {speed.shape}, {slope.shape}")
@@ -119,28 +124,30 @@ def load_cycle(path: Path | str) -> Cycle:
     ]
     if not lines:
         raise ConfigError(path, "", "is empty", "a header line time_s,speed_mps[,grade] and two rows or more")
-    header = [name.strip() for name in _fields(path, *lines[0])]
-    for name in _REQUIRED:
-        if name not in header:
-            raise ConfigError(path, f"line {lines[0][0]}", f"column '{name}' is missing", "time_s,speed_mps[,grade]")
-    for name in header:
-        if name not in (*_REQUIRED, "grade") or header.count(name) > 1:
-            problem = "stands twice" if header.count(name) > 1 else "is unknown"
-            raise ConfigError(path, f"line {lines[0][0]}", f"column '{name}' {problem}", "time_s,speed_mps[,grade]")
-
+    header = _header(path, *lines[0])
+    if len(lines) - 1 > MAX_SAMPLES:
+        raise ConfigError(path, "", f"has {len(lines) - 1} rows", f"<= {MAX_SAMPLES}")
     values = np.empty((len(lines) - 1, len(header)))
     for row, (number, line) in enumerate(lines[1:]):
         fields = _fields(path, number, line)
         if len(fields) != len(header):
-            raise ConfigError(path, f"line {number}", f"has {len(fields)} values", f"{len(header)}, as in the header")
+            hint = ": decimal commas? import_cycle reads them" if len(fields) == 2 * len(header) else ""
+            problem = f"has {len(fields)} values{hint}"
+            raise ConfigError(path, f"line {number}", problem, f"{len(header)}, as in the header")
         for column, field in enumerate(fields):
             try:
-                values[row, column] = float(field)
-            except ValueError:
-                raise ConfigError(path, f"line {number}", f"{header[column]} '{field.strip()}' is no number") from None
+                values[row, column] = to_number(field)
+            except ValueError as error:
+                raise ConfigError(path, f"line {number}", f"{header[column]} {error}") from None
     columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(header)}
     columns.setdefault("grade", np.zeros(len(values)))
-    _check_rows(path, [f"line {number}" for number, _ in lines[1:]], columns)
+    places = [f"line {number}" for number, _ in lines[1:]]
+    columns["speed_mps"] = at_rest(columns["speed_mps"])
+    _check_rows(path, places, columns)
+    found = trace_units.implausible(columns["time_s"], columns["speed_mps"])
+    if found:
+        at, words = found
+        raise ConfigError(path, places[at] if at >= 0 else "", f"speed_mps {words}")
     return Cycle(
         name=Path(path).stem,
         time_s=columns["time_s"],
@@ -151,7 +158,32 @@ def load_cycle(path: Path | str) -> Cycle:
     )
 
 
+def at_rest(speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The speeds with the noise of a sensor at rest taken for rest."""
+    return np.where((speed_mps < 0.0) & (speed_mps >= -REST_NOISE_MPS), 0.0, speed_mps)
+
+
+def _header(path: Path | str, number: int, line: str) -> list[str]:
+    allowed = "time_s,speed_mps[,grade]"
+    header = [name.strip() for name in _fields(path, number, line)]
+    where = f"line {number}"
+    if len(header) == 1 and any(mark in line for mark in ";\t|"):
+        mark = next(mark for mark in ";\t|" if mark in line)
+        problem = f"is separated by {'tabs' if mark == chr(9) else repr(mark)}: import_cycle reads that"
+        raise ConfigError(path, where, problem, allowed)
+    for name in _REQUIRED:
+        if name not in header:
+            raise ConfigError(path, where, f"column '{name}' is missing", allowed)
+    for name in header:
+        if name not in (*_REQUIRED, "grade") or header.count(name) > 1:
+            problem = "stands twice" if header.count(name) > 1 else "is unknown"
+            raise ConfigError(path, where, f"column '{name}' {problem}", allowed)
+    return header
+
+
 def _fields(path: Path | str, number: int, line: str) -> list[str]:
+    if len(line) > MAX_LINE_LENGTH:
+        raise ConfigError(path, f"line {number}", f"has {len(line)} characters", f"<= {MAX_LINE_LENGTH}")
     try:
         return next(csv.reader([line], strict=True))
     except csv.Error as error:
@@ -170,9 +202,18 @@ def _check_rows(path: Path | str, places: list[str], columns: dict[str, NDArray[
             bad = np.flatnonzero((values < low) | (values > high))
             if bad.size:
                 problem = f"{name} {values[bad[0]]:g} is out of range"
+                if name == "speed_mps" and values[bad[0]] > high:
+                    problem += _unit_hint(columns)
                 raise ConfigError(path, places[bad[0]], problem, f"{low:g} to {high:g}")
     back = np.flatnonzero(np.diff(columns["time_s"]) <= 0.0)
     if back.size:
         at = int(back[0]) + 1
         before = columns["time_s"][at - 1]
         raise ConfigError(path, places[at], f"time_s {columns['time_s'][at]:g} does not increase", f"> {before:g} s")
+
+
+def _unit_hint(columns: dict[str, NDArray[np.float64]]) -> str:
+    """What speeds beyond every car's probably are."""
+    time, speed = columns["time_s"], columns["speed_mps"]
+    usable = np.all(np.isfinite(time)) and np.all(np.isfinite(speed)) and np.all(np.diff(time) > 0.0)
+    return trace_units.hint(time, speed) if usable else ""

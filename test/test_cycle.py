@@ -70,6 +70,16 @@ def test_windows_line_ends_and_a_byte_order_mark_are_read(write):
         ("time_s,speed_mps\n0,1\n1,nan\n", "line 3: speed_mps nan is not finite"),
         ("time_s,speed_mps\n0,1\ninf,1\n", "line 3: time_s inf is not finite"),
         ("time_s,speed_mps\n0,1\n1,-0.1\n", "line 3: speed_mps -0.1 is out of range; allowed: 0 to 70"),
+        ("time_s,speed_mps\n0,0\n1_0,1_2\n", "line 3: time_s '1_0' is no number: write it without separators"),
+        ("time_s,speed_mps\n0,0\n\u0661,1\n", "line 3: time_s '\u0661' is no number: write the digits 0 to 9"),
+        ("time_s,speed_mps\n0,0\n1,\u22125\n", "speed_mps '\u22125' is no number: its sign is a dash; write -"),
+        ("time_s,speed_mps\n0,0\n1,50 km/h\n", "is no number: write it without a unit"),
+        ("time_s,speed_mps\n0,0,1,5\n1,0,1,5\n", "line 2: has 4 values: decimal commas? import_cycle reads them"),
+        ("time_s;speed_mps\n0;0\n1;1\n", "line 1: is separated by ';': import_cycle reads that"),
+        ("time_s\tspeed_mps\n0\t0\n1\t1\n", "line 1: is separated by tabs"),
+        ("time_s,speed_mps\n0,0\n1," + "1" * 400 + "\n", "is no number: it has 400 characters, more than 40"),
+        ("time_s,speed_mps\n0,0\n1," + "1" * 5000 + "\n", "line 3: has 5002 characters; allowed: <= 4096"),
+        ("time_s,speed_mps\n0," + '"' * 200_001 + "\n", "line 2: has 200003 characters"),
         ("time_s,speed_mps\n0,1\n1,71\n", "line 3: speed_mps 71 is out of range"),
         ("time_s,speed_mps,grade\n0,1,0\n1,1,0.6\n", "line 3: grade 0.6 is out of range; allowed: -0.5 to 0.5"),
         ("time_s,speed_mps\n# pause\n0,1\n2,1\n\n2,1\n", "line 6: time_s 2 does not increase; allowed: > 2 s"),
@@ -127,3 +137,55 @@ def test_a_cycle_shorter_or_far_longer_than_the_step_is_refused():
         make_cycle("made", [0.0, 0.05], [0.0, 1.0]).resample(0.1)
     with pytest.raises(ConfigError, match="too long for steps"):
         make_cycle("made", [0.0, 1e9], [0.0, 1.0]).resample(0.1)
+
+
+# --- Units -----------------------------------------------------------------------------------------------------------
+
+
+def scaled(name, time=1.0, speed=1.0, every=1):
+    """A shipped cycle with its columns in other units."""
+    cycle = load_cycle(share_path(f"config/cycles/{name}.csv"))
+    rows = zip(cycle.time_s[::every] * time, cycle.speed_mps[::every] * speed, strict=True)
+    return "time_s,speed_mps\n" + "".join(f"{t:.6f},{v:.6f}\n" for t, v in rows)
+
+
+@pytest.mark.parametrize("name", ["ftp75", "hwfet", "nycc", "udds"])
+@pytest.mark.parametrize(
+    ("time", "speed", "words"),
+    [
+        (1.0, 3.6, "looks like km/h in the m/s column"),
+        (1e3, 1.0, "looks like ms in the s column"),
+        (1e9, 1.0, "looks like ns in the s column"),
+        (1.0 / 60.0, 1.0, "looks like"),
+        (1e3, 3.6, "in the m/s column"),
+    ],
+)
+def test_a_cycle_in_other_units_is_refused_with_the_likely_one(write, name, time, speed, words):
+    with pytest.raises(ConfigError) as caught:
+        load_cycle(write(scaled(name, time, speed)))
+    assert words in str(caught.value)
+    assert "import_cycle converts" in str(caught.value)
+
+
+def test_the_line_of_an_impossible_acceleration_is_named(write):
+    text = "time_s,speed_mps\n" + "".join(f"{t},{min(10 * t, 60)}\n" for t in range(60))
+    with pytest.raises(ConfigError, match=r"line 2: speed_mps gains 10 m/s in a second, .*: looks like km/h"):
+        load_cycle(write(text))
+    text = "time_s,speed_mps\n0,20\n1,20\n2,5\n3,5\n"
+    with pytest.raises(ConfigError, match=r"line 3: speed_mps loses 15 m/s in a second, and no car does"):
+        load_cycle(write(text))
+
+
+def test_hard_driving_slow_driving_and_noise_are_no_mistake(write):
+    load_cycle(write("time_s,speed_mps\n0,0\n5,40\n20,40\n24,0\n"))
+    load_cycle(write("time_s,speed_mps\n0,0\n1000,20\n"))
+    load_cycle(write("time_s,speed_mps\n" + "".join(f"{t},13.9\n" for t in range(100))))
+    rng = np.random.default_rng(3)
+    trace = load_cycle(share_path("config/cycles/nycc.csv")).resample(0.1)
+    noisy = np.maximum(trace.speed_mps + rng.normal(0.0, 0.2 / 3.6, trace.time_s.size), 0.0)
+    load_cycle(write("time_s,speed_mps\n" + "".join(f"{t},{v}\n" for t, v in zip(trace.time_s, noisy, strict=True))))
+
+
+def test_noise_of_a_sensor_at_rest_is_rest(write):
+    assert load_cycle(write("time_s,speed_mps\n0,-0.001\n1,1\n")).speed_mps.tolist() == [0.0, 1.0]
+    assert make_cycle("made", [0, 1], [-0.05, 1.0]).speed_mps.tolist() == [0.0, 1.0]

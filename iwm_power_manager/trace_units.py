@@ -1,0 +1,96 @@
+"""Units of a speed trace, told by its accelerations: what no car does is probably another unit."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+#: In m/s and in s.
+SPEED_UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0, "cm/s": 0.01}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+
+#: Beyond these, m/s2 as the mean of a second, a trace is no car's: a tyre on a dry road gives 1 g and a little more.
+MAX_ACCELERATION_MPS2 = 9.0
+MAX_DECELERATION_MPS2 = 13.0
+#: A car that goes through a range of speeds does so faster than this at least once.
+MIN_ACCELERATION_MPS2 = 0.02
+_MIN_SAMPLES, _MIN_SPEED_RANGE_MPS = 10, 3.0
+_WINDOW_S = 1.0
+#: What driving looks like, m/s2: the harder of acceleration and braking is more than this, and neither beyond its own.
+_USUAL_LOW, _USUAL_RISE, _USUAL_FALL = 0.3, 5.0, 9.0
+_MAX_SPEED_MPS = 70.0
+
+
+class Steepest(NamedTuple):
+    """Hardest change of speed over a second (or a sample, if that is longer), with where it begins.
+
+    Attributes
+    ----------
+    rise_mps2, fall_mps2 : both >= 0
+    rise_at, fall_at : index of the sample
+    """
+
+    rise_mps2: float
+    fall_mps2: float
+    rise_at: int
+    fall_at: int
+
+
+def steepest(time_s: FloatArray, speed_mps: FloatArray) -> Steepest:
+    """The hardest acceleration and braking of a trace of two points or more, times rising."""
+    span = time_s[-1] - time_s[0]
+    window = min(_WINDOW_S, span)
+    # A window from every sample; what lies behind the end counts up to the end.
+    start = np.minimum(time_s, time_s[-1] - window)
+    change = np.interp(start + window, time_s, speed_mps) - np.interp(start, time_s, speed_mps)
+    rate = change / window
+    up, down = int(np.argmax(rate)), int(np.argmin(rate))
+    return Steepest(max(float(rate[up]), 0.0), max(-float(rate[down]), 0.0), up, down)
+
+
+def likely_units(time: FloatArray, speed: FloatArray) -> tuple[str, str] | None:
+    """Units of speed and time in which a trace looks like driving; None if there are none."""
+    for time_unit, seconds in TIME_UNITS.items():
+        for speed_unit, metres in SPEED_UNITS.items():
+            if float(np.max(speed)) * metres > _MAX_SPEED_MPS:
+                continue
+            with np.errstate(over="ignore"):
+                found = steepest(time * seconds, speed * metres)
+            hardest = max(found.rise_mps2, found.fall_mps2)
+            if hardest >= _USUAL_LOW and found.rise_mps2 <= _USUAL_RISE and found.fall_mps2 <= _USUAL_FALL:
+                return speed_unit, time_unit
+    return None
+
+
+def implausible(time_s: FloatArray, speed_mps: FloatArray) -> tuple[int, str] | None:
+    """Why a trace is no car's, with the sample at fault; None if it may be one."""
+    found = steepest(time_s, speed_mps)
+    at, problem = -1, ""
+    if found.rise_mps2 > MAX_ACCELERATION_MPS2:
+        at, problem = found.rise_at, f"gains {found.rise_mps2:.3g} m/s in a second, and no car does"
+    elif found.fall_mps2 > MAX_DECELERATION_MPS2:
+        at, problem = found.fall_at, f"loses {found.fall_mps2:.3g} m/s in a second, and no car does"
+    elif (
+        time_s.size >= _MIN_SAMPLES
+        and float(np.ptp(speed_mps)) > _MIN_SPEED_RANGE_MPS
+        and max(found.rise_mps2, found.fall_mps2) < MIN_ACCELERATION_MPS2
+    ):
+        problem = f"never changes by more than {max(found.rise_mps2, found.fall_mps2):.2g} m/s in a second"
+    if not problem:
+        return None
+    return at, problem + hint(time_s, speed_mps)
+
+
+def hint(time_s: FloatArray, speed_mps: FloatArray) -> str:
+    """What the columns probably hold, as the end of a sentence; "" where no unit would help."""
+    units = likely_units(time_s, speed_mps)
+    if units is None or units == ("m/s", "s"):
+        return ""
+    speed_unit, time_unit = units
+    likely = [f"{speed_unit} in the m/s column"] if speed_unit != "m/s" else []
+    likely += [f"{time_unit} in the s column"] if time_unit != "s" else []
+    return f": looks like {' and '.join(likely)} (import_cycle converts)"
