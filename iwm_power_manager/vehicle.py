@@ -200,8 +200,12 @@ def _axles(
     given = {axle: _sections(path, content, axle) for axle in ("front", "rear")}
     motors = {axle: _numbers(path, "motor", *found.sections["motor"], _MOTOR_OPTIONS) for axle, found in given.items()}
     top_speed_mps = plausibility.top_speed_mps(chassis, 2.0 * sum(motor["max_power_w"] for motor in motors.values()))
-    axles, notes = [], []
+    axles: list[Axle] = []
+    notes: list[str] = []
     for axle, found in given.items():
+        if axles and found == given["front"]:  # one section for both: the same numbers, and the same arrays
+            axles.append(axles[0])
+            break
         wheel = Wheel(**_numbers(path, "wheel", *found.sections["wheel"]))
         gear = _numbers(path, "gear", *found.sections["gear"], (), chassis) if "gear" in found.sections else None
         shaft_radps = top_speed_mps / wheel.radius_m * (gear["ratio"] if gear else 1.0)
