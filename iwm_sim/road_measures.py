@@ -1,8 +1,10 @@
 """What a drive on a real road amounts to: how it stops, stays in its lane, holds, and what its wheels do meanwhile.
 
 Every measure is a function of a finished run; `NAMES` are what a scenario's `require` may bound. Those of a braking
-begin when the driver first asks for braking and end at standstill or at the end. UN Regulation No. 13-H, Annex 6, is
-the source of several: the paragraphs stand with them.
+begin when the driver first asks for braking and end at standstill or at the end. Several are those of UN Regulation No.
+13-H, Annex 6 (tests of vehicles with anti-lock systems; Appendix 2, utilisation of adhesion; Appendix 3, performance on
+differing adhesion surfaces), in EUR-Lex 2026/502. Its table of contents was read, its paragraphs were not: their
+numbers are therefore not cited, and the bounds are as they are commonly quoted.
 """
 
 from __future__ import annotations
@@ -96,7 +98,7 @@ def stopping_time_s(d: Driven) -> float:
 
 
 def braking_rate(d: Driven) -> float:
-    """Braking rate z = 0.849 / t with the time from 45 to 15 km/h (Annex 6, Appendix 2); 0 if that is not reached."""
+    """Braking rate z = 0.849 / t with the time from 45 to 15 km/h (Appendix 2); 0 if that is not reached."""
     speed = np.abs(d["speed_mps"])
     fast = np.flatnonzero(speed >= RATE_FROM_MPS)
     slow = np.flatnonzero(speed <= RATE_TO_MPS)
@@ -108,12 +110,12 @@ def braking_rate(d: Driven) -> float:
 
 
 def adhesion_used(d: Driven) -> float:
-    """Braking rate over the road's peak friction, where it is lowest (Annex 6, 5.2: at least 0.75)."""
+    """Braking rate over the road's peak friction, where it is lowest (Annex 6 asks for 0.75)."""
     return braking_rate(d) / float(np.min(d.wheels("road_{}")))
 
 
 def split_rate(d: Driven) -> float:
-    """Braking rate over what a split road asks for, 0.75 (4 k2 + k1) / 5 and k2, the larger (Annex 6, 5.3.6)."""
+    """Braking rate over what a split road asks for, 0.75 (4 k2 + k1) / 5 and k2, the larger (Annex 6)."""
     road = d.wheels("road_{}")[d.braking :]
     high, low = float(road.max()), float(road.min())
     return braking_rate(d) / max(0.75 * (4.0 * low + high) / 5.0, low)
@@ -203,13 +205,13 @@ def _steering_deg(d: Driven) -> FloatArray:
 
 
 def steering_2s_deg(d: Driven) -> float:
-    """Largest angle of the steering wheel in the first 2 s of a braking (Annex 6, 5.3.5: at most 120)."""
+    """Largest angle of the steering wheel in the first 2 s of a braking (Annex 6: at most 120 degrees)."""
     part = _steering_deg(d)[d.braking : d.braking + round(2.0 / d.run.dt_s)]
     return float(part.max()) if part.size else 0.0
 
 
 def steering_deg(d: Driven) -> float:
-    """Largest angle of the steering wheel (Annex 6, 5.3.5: at most 240)."""
+    """Largest angle of the steering wheel (Annex 6: at most 240 degrees)."""
     return float(_steering_deg(d).max())
 
 
