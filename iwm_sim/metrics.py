@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_sim.closed_loop import Run
@@ -54,6 +53,8 @@ class Metrics(NamedTuple):
 
 def trace_excess_mps(trace_mps: FloatArray, speed_mps: FloatArray, dt_s: float) -> float:
     """How far the speed leaves the band between the lowest and highest trace point within 1 s, less and plus 2 mph."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
     width = 2 * round(TRACE_WINDOW_S / dt_s) + 1
     low = minimum_filter1d(trace_mps, width, mode="nearest") - TRACE_TOLERANCE_MPS
     high = maximum_filter1d(trace_mps, width, mode="nearest") + TRACE_TOLERANCE_MPS

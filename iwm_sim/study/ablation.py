@@ -1,14 +1,13 @@
 """Why the paper's program loses: what each of its choices costs, changed alone and all together.
 
-The base is `paper_sdp`. Each change takes one thing from grid `coupled` or `fine`, or from how the policy is used; the
-problem is solved anew and driven. The single changes were named before any of them was driven, and which two belong
-together after.
+The base is `paper_sdp`. Each change is one setting of its grid, or how the policy is used; the problem is
+solved anew and driven. The single changes were named before any of them was driven, which two belong together after.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,23 +31,27 @@ class Step(NamedTuple):
     Attributes
     ----------
     meaning : what becomes of what
-    taken : names of settings, from which grid
+    settings : of the grid, by name
     strategy : "" leaves interpolation in the table
     """
 
     meaning: str
-    taken: tuple[tuple[str, str], ...] = ()
+    settings: Mapping[str, Any] = {}
     strategy: str = ""
 
 
+#: Fine where it matters: at low speed, and near no slip.
+_SPEEDS_MPS = (0, 0.1, 0.5, 1, 1.5, 2, 2.5, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30, 33, 36)
+_SLIPS = {"mirrored": (0, 0.004, 0.012, 0.03, 0.06, 0.1, 0.15, 0.21, 0.35, 1)}
+
 STEPS = {
-    "speed grid": Step("4 speeds become 26", (("speed_mps", "coupled"),)),
-    "slip grid": Step("11 slips an axle become 19", (("slip_front", "fine"), ("slip_rear", "fine"))),
-    "error at the road": Step("power error at the wheel becomes that at the road", (("power_error", "coupled"),)),
-    "size of the error": Step("the squared power error becomes its size", (("error_norm", "coupled"),)),
-    "alpha": Step("the weight of the power error, 2, becomes 20", (("alpha", "coupled"),)),
-    "gamma": Step("discount 0.98 becomes 0.99", (("discount", "fine"),)),
-    "look-ahead": Step("one step ahead on the cost-to-go instead of interpolating shares", (), "sdp_lookahead"),
+    "speed grid": Step("4 speeds become 26", {"speed_mps": _SPEEDS_MPS}),
+    "slip grid": Step("11 slips an axle become 19", {"slip_front": _SLIPS, "slip_rear": _SLIPS}),
+    "error at the road": Step("power error at the wheel becomes that at the road", {"power_error": "road"}),
+    "size of the error": Step("the squared power error becomes its size", {"error_norm": "absolute"}),
+    "alpha": Step("the weight of the power error, 2, becomes 20", {"alpha": 20.0}),
+    "gamma": Step("discount 0.98 becomes 0.99", {"discount": 0.99}),
+    "look-ahead": Step("one step ahead on the cost-to-go instead of interpolating shares", {}, "sdp_lookahead"),
 }
 #: Steps taken together: the two that help most alone, the grids with them, and all.
 TOGETHER = {
@@ -126,8 +129,7 @@ def _changed(
     paper_grid = VARIANTS[labels.PAPER_SDP].grid
     settings: dict[str, Any] = load_grid(paper_grid).settings()
     for name in names:
-        for setting, grid in STEPS[name].taken:
-            settings[setting] = load_grid(grid).settings()[setting]
+        settings |= STEPS[name].settings
     del settings["name"]
     file = folder / f"{'_'.join(label.replace('-', ' ').split())}.yaml"  # JSON is YAML
     atomic_write(file, json.dumps(settings | {"format": PROBLEM_FORMAT}).encode())

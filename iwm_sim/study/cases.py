@@ -30,20 +30,15 @@ from iwm_power_manager.vehicle import Vehicle, load_vehicle, with_params
 from iwm_sim import closed_loop, preview
 from iwm_sim.closed_loop import Noise, Run
 from iwm_sim.metrics import Metrics, measure
+from iwm_sim.study.names import REFERENCE
 
 FloatArray = npt.NDArray[np.float64]
 
 #: Strategies that need a solved policy.
 POLICY_STRATEGIES = frozenset(name for name, known in STRATEGIES.items() if known.needs_policy)
 
-#: Every saving is against this one.
-REFERENCE = "equal"
-
 #: The cycle the generalized rule is fitted to, as in the paper.
 RULE_CYCLE = "config/cycles/ftp75.csv"
-
-#: The largest step a case may have: beyond it, the law's time constants mean nothing.
-MAX_DT_S = 0.1
 
 
 class SensorNoise(NamedTuple):

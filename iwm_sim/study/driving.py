@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import multiprocessing
-import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -26,11 +25,6 @@ _HIGHEST_WEIGHT = 6.0
 
 #: Long enough to run through every kernel of a drive.
 _WARM_UP_S = 0.1
-
-
-def cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0))
 
 
 def on_all_cores(

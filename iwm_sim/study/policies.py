@@ -17,12 +17,10 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import grid_path, solve_one
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.study.cases import policy_of
+from iwm_sim.study.names import DEFAULT_GRID
 
 #: Cycles a policy learns its demand from, as in the paper. UDDS is a part of FTP-75.
 TRAINING_CYCLES = tuple(f"config/cycles/{name}.csv" for name in ("ftp75", "hwfet", "nycc"))
-
-#: Grid of a policy that is solved because none was found.
-DEFAULT_GRID = "coupled"
 
 
 class PolicySource:

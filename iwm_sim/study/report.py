@@ -18,17 +18,18 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
 from iwm_power_manager import __version__
 from iwm_power_manager.files import atomic_write
 from iwm_sim.study.palette import COLOURS, INK
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: Points a chart keeps of each series: two (smallest and largest) for each of half as many equal stretches of samples.
 CHART_POINTS = 6000
@@ -352,6 +353,8 @@ def svg_of(figure: Figure, prefix: str, title: str) -> str:
     Text stays text (selectable, in the page's font), `palette.COLOURS` and the ink become the page's own colours, and
     every id gets `prefix`, so that the definitions of two figures on one page do not mix.
     """
+    import matplotlib as mpl
+
     buffer = io.StringIO()
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": prefix}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_sim.metrics import Metrics
-from iwm_sim.study.cases import REFERENCE, Case, Result, cycle_of, policy_of, vehicle_of
+from iwm_sim.study.cases import Case, Result, cycle_of, policy_of, vehicle_of
+from iwm_sim.study.names import REFERENCE
 
 #: Energies of two runs are compared if the distances differ by no more than this.
 SAME_DISTANCE = 1e-3

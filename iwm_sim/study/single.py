@@ -11,6 +11,7 @@ from iwm_sim.study import battery_fit, cases, labels, paper
 from iwm_sim.study.cases import Case, Result
 from iwm_sim.study.content import frontier_of
 from iwm_sim.study.driving import drive_all
+from iwm_sim.study.names import TABLES
 from iwm_sim.study.plan import (
     FRONTIER_CYCLE,
     FRONTIER_FRICTION,
@@ -39,10 +40,6 @@ from iwm_sim.study.study_figures import (
     window_of,
 )
 from iwm_sim.study.study_tables import TableOf, paper_tables, table_6
-
-#: Tables of the paper that can be driven alone, and their frictions.
-TABLES = {str(number): (friction,) for friction, number in paper.TABLES.items()} | {"6": paper.FRICTIONS}
-FIGURES = ("7", "8", "9", "10", "12", "13", "14", "15", "transitions", "frontier")
 
 #: Strategies that Tables 3 to 5 show.
 _SHOWN = (labels.ED, labels.GRDP, labels.PAPER_SDP, labels.OURS, labels.BOUND)

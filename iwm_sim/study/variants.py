@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from iwm_power_manager.control.settings import GATE_MODES, Settings
-from iwm_sim.study.cases import Case
+
+if TYPE_CHECKING:
+    from iwm_sim.study.cases import Case
 
 #: The paper decides every 0.1 s.
 PAPER_PERIOD_S = 0.1

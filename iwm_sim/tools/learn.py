@@ -46,7 +46,7 @@ from iwm_sim.learning import (
     learn,
     recorded_cycle,
 )
-from iwm_sim.study.driving import cores
+from iwm_sim.study.names import cores
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 

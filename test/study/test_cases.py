@@ -113,4 +113,4 @@ def test_changes_reach_the_numbers_they_name():
     params = cases.vehicle_of(VEHICLE, "none").params
     changed = cases.changed(params, [Change("motor", "loss_constant_w", 40.0)])
     assert changed.front.motor.loss_constant_w == 40.0
-    assert changed.with_axles(motor=params.front.motor) == params
+    assert repr(changed.with_axles(motor=params.front.motor)) == repr(params)

@@ -1,0 +1,270 @@
+"""What `evaluate` does with its options; imported when they are known, so that `--help` needs none of it."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import json
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from iwm_power_manager import __version__
+from iwm_power_manager.control import settings as law_settings
+from iwm_power_manager.control.strategies import DEFAULT_STRATEGY
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import atomic_write
+from iwm_sim.closed_loop import COLUMNS as SIGNALS
+from iwm_sim.road_report import text as road_text
+from iwm_sim.road_run import check_scenario
+from iwm_sim.scenario import load_scenario
+from iwm_sim.study import ablation, battery_fit, cases, figures, paper, reproduce, single
+from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result, SensorNoise
+from iwm_sim.study.driving import Progress, drive_all, silent, tell, warm_up, with_rules
+from iwm_sim.study.names import REFERENCE, TABLES
+from iwm_sim.study.plan import Policies
+from iwm_sim.study.policies import PolicySource
+from iwm_sim.study.rows import Row, rows_of
+from iwm_sim.study.tables import plain_table, text_table
+from iwm_sim.study.variants import VARIANTS
+
+
+def run(mode: str, options: argparse.Namespace) -> None:
+    """Do what is asked for; `mode` is a key of `evaluate.MODES`, or "" for single cases."""
+    _RUN[mode](options)
+
+
+# --- cases ----------------------------------------------------------------------------------------------------------
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    if not options.cycle:
+        raise ConfigError("arguments", "--cycle", "is missing", "one drive cycle or more, for instance nycc")
+    started = time.perf_counter()
+    say = silent if options.quiet else tell
+    wanted = planned(options, say)
+    with Progress(len(wanted), options.quiet) as progress:
+        warm_up(wanted, say)
+        wanted = with_rules(wanted, options.jobs)
+        drive = _Saving(options.save_series) if options.save_series else cases.result
+        results = drive_all(wanted, options.jobs, progress.update, drive)
+    rows = rows_of(results)
+    if not options.quiet:
+        print(text_table(rows))
+        for line in remarks(rows):
+            print(line)
+        say(f"{len(rows)} cases in {time.perf_counter() - started:.1f} s")
+    if options.json:
+        content = {"package_version": __version__, "rows": [row.to_json() for row in rows]}
+        atomic_write(options.json, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+        say(f"rows: {options.json}")
+
+
+def planned(options: argparse.Namespace, say: Callable[[str], None]) -> list[Case]:
+    """The cases of a command line, each checked, with their policies found or solved. Equal split is always there."""
+    if options.save_series:
+        _make_folder(options.save_series)
+    strategies = list(dict.fromkeys([REFERENCE, *(options.strategy or [DEFAULT_STRATEGY])]))
+    settings = _settings(options)
+    result: list[tuple[str, Case]] = []
+    for idle_drive in dict.fromkeys(options.idle_drive or [""]):
+        vehicle = cases.vehicle_of(options.vehicle, idle_drive)
+        for cycle in dict.fromkeys(options.cycle):
+            for friction in dict.fromkeys(options.friction or [0.9]):
+                base = Case(
+                    cycle=cycle,
+                    vehicle=options.vehicle,
+                    idle_drive=vehicle.idle_drive,
+                    friction=friction,
+                    strategy=REFERENCE,
+                    settings=settings,
+                    dt_s=options.dt,
+                    substeps=options.substeps,
+                    soc=options.initial_soc,
+                    assumed_friction=options.assumed_friction,
+                    noise=SensorNoise(options.noise[0], options.noise[1], options.seed),
+                )
+                for name in strategies:
+                    known = VARIANTS[name].case(base, name) if name in VARIANTS else None
+                    result.append((name, known or dataclasses.replace(base, strategy=name)))
+                    cases.check(result[-1][1])
+    # Policies last: a wrong cycle must not be found after a minute of solving.
+    source = PolicySource(options.policy, options.grid, not options.no_solve, say)
+
+    @functools.cache
+    def find(idle_drive: str, friction: float) -> str:
+        return source.find(cases.vehicle_of(options.vehicle, idle_drive), friction)
+
+    policies = Policies(options.vehicle, options.policy, say)
+    return [_with_policy(name, case, options, find, policies) for name, case in result]
+
+
+def _with_policy(
+    name: str, case: Case, options: argparse.Namespace, find: Callable[[str, float], str], policies: Policies
+) -> Case:
+    if name in VARIANTS:
+        return dataclasses.replace(case, policy=policies.of_variant(name, case.idle_drive, case.told_friction))
+    if name in POLICY_STRATEGIES:
+        return dataclasses.replace(case, policy=find(case.idle_drive, case.told_friction))
+    if name != "preview":
+        return case
+    if options.switching_cost is None:
+        case = cases.priced_as(case, find(case.idle_drive, case.told_friction))
+    else:
+        case = dataclasses.replace(case, switching_cost_j=options.switching_cost)
+    return dataclasses.replace(case, label=f"preview, {case.price_text}")
+
+
+def _settings(options: argparse.Namespace) -> law_settings.Settings:
+    given = {name: value for name, value in vars(options).items() if name in law_settings.TABLE and name != "strategy"}
+    settings = law_settings.DEFAULTS._replace(**given)
+    if settings.gate_mode == law_settings.GATE_MODE_TABLE2:
+        settings = settings._replace(gate_hysteresis=0.0)  # as printed
+    if (
+        settings.decision_period_s < options.dt
+        and settings.decision_period_s != law_settings.DEFAULTS.decision_period_s
+    ):
+        raise ConfigError(
+            "arguments",
+            "--decision-period",
+            f"{settings.decision_period_s:g} s is shorter than the control step",
+            f"at least --dt {options.dt:g} s",
+        )
+    target = min(settings.slip_target, 0.75 * settings.critical_slip)  # the limiter works in front of the gate
+    settings = settings._replace(slip_target=target, decision_period_s=max(settings.decision_period_s, options.dt))
+    problem = law_settings.check_together(settings._asdict())
+    if problem:
+        raise ConfigError("arguments", *problem.split(": ", 1))
+    return settings
+
+
+class _Saving:
+    """Drives a case and writes its series; an object, because workers can be sent no closure."""
+
+    def __init__(self, folder: str) -> None:
+        self._folder = folder
+
+    def __call__(self, case: Case) -> Result:
+        made = cases.result(dataclasses.replace(case, keep=SIGNALS))
+        cases.save_series(self._folder, made)
+        return Result(case, made.metrics, {})
+
+
+def remarks(rows: Sequence[Row]) -> list[str]:
+    """Sentences below the table, about what its marks mean."""
+    lines = []
+    if not all(row.metrics.trace_held for row in rows):
+        lines.append("lost: the car left the EPA tolerance by the m/s shown; its energy says little")
+    if any(row.same_distance_as_equal is False for row in rows):
+        lines.append("no saving: the distance differs from that of equal split by more than 0.1 %; compare Wh/km")
+    with_policy = [row.made_with for row in rows if row.made_with["policy_friction"]]
+    for told, solved_for in sorted({(made["assumed_friction"], made["policy_friction"]) for made in with_policy}):
+        if told != solved_for:
+            lines.append(f"friction {told:g} was driven with the policy for {solved_for:g}, the nearest there is")
+    return lines
+
+
+def _make_folder(path: str) -> None:
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(path, "", f"cannot be created: {error.strerror}", "a folder") from None
+
+
+# --- instead of cases -----------------------------------------------------------------------------------------------
+
+
+def _study(options: argparse.Namespace) -> None:
+    reproduce.study(
+        Path(options.study),
+        vehicle=options.vehicle,
+        policy=options.policy,
+        jobs=options.jobs,
+        quiet=options.quiet,
+        document=Path(options.update_doc) if options.update_doc else None,
+    )
+
+
+def _paper(options: argparse.Namespace) -> None:
+    say = silent if options.quiet else tell
+    cycles = list(dict.fromkeys(options.cycle or paper.CYCLES))
+    idle_drives = list(dict.fromkeys(options.idle_drive or ("none", "drag")))
+    for cycle in cycles:
+        cases.cycle_of(cycle)
+    policies = Policies(options.vehicle, options.policy, say)
+    for table in single.paper_table(options.paper, policies, cycles, idle_drives, options.jobs):
+        print(f"{table.title or table.section}\n{plain_table(table.rows, table.columns)}\n")
+    print(f"{table.note}\n{_policies_text(policies, options.paper, idle_drives)}")
+
+
+def _policies_text(policies: Policies, table: str, idle_drives: Sequence[str]) -> str:
+    """Which policies a table was driven with."""
+    lines = ["control at 100 Hz; ours decides every 0.02 s, the paper's every 0.1 s; policies:"]
+    names = ("paper_sdp_ungated", "paper_sdp_table2") if table == "6" else ("paper_sdp",)
+    for friction in TABLES[table]:
+        for idle_drive in idle_drives:
+            used = {"ours": policies.ours(idle_drive, friction)}
+            used |= {name: policies.of_variant(name, idle_drive, friction) for name in names}
+            found = {name: cases.policy_of(path) for name, path in used.items()}
+            text = ", ".join(f"{name}: {policy.problem.name} {policy.checksum[:8]}" for name, policy in found.items())
+            lines.append(f"  friction {friction:g}, idle drive {idle_drive}: {text}")
+    return "\n".join(lines)
+
+
+def _figure(options: argparse.Namespace) -> None:
+    if not options.plot:
+        raise ConfigError("arguments", "--plot", "is missing", "a file that ends in .svg or .png")
+    battery_fit.check_picture(options.plot)
+    policies = Policies(options.vehicle, options.policy, silent if options.quiet else tell)
+    drawn = single.figure(options.figure, policies, options.jobs)
+    battery_fit.save_picture(drawn.figure, options.plot)
+    if not options.quiet:
+        print(f"{drawn.title}. {drawn.note}\npicture: {options.plot}")
+
+
+def _ablation(options: argparse.Namespace) -> None:
+    say = silent if options.quiet else tell
+    with tempfile.TemporaryDirectory(prefix="iwm-ablation-") as folder:
+        rows = ablation.ablation(Policies(options.vehicle, options.policy, say), Path(folder), options.jobs, say)
+    if not options.quiet:
+        print(plain_table(rows, ablation.columns(rows)))
+    if options.json:
+        content = {"package_version": __version__, "rows": [dataclasses.asdict(row) for row in rows]}
+        atomic_write(options.json, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _fit_battery(options: argparse.Namespace) -> None:
+    if options.plot:
+        battery_fit.check_picture(options.plot)
+    fit = battery_fit.fit(
+        options.vehicle,
+        (options.idle_drive or [""])[0],
+        options.cycle or battery_fit.CYCLES,
+        (options.friction or [0.9])[0],
+        options.initial_soc,
+    )
+    if not options.quiet:
+        print(fit.text())
+    if options.plot:
+        battery_fit.save_picture(figures.model_comparison(*fit.comparison), options.plot)
+        tell(f"picture: {options.plot}")
+    if options.json:
+        atomic_write(options.json, (json.dumps(fit.to_json(), indent=1, allow_nan=False) + "\n").encode())
+
+
+def _scenario(options: argparse.Namespace) -> None:
+    for scenario in [load_scenario(name) for name in options.scenario]:
+        print(road_text(check_scenario(scenario)), flush=True)
+
+
+_RUN = {
+    "": _evaluate,
+    "study": _study,
+    "paper": _paper,
+    "figure": _figure,
+    "ablation": _ablation,
+    "fit_battery": _fit_battery,
+    "scenario": _scenario,
+}
