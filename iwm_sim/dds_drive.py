@@ -62,6 +62,7 @@ class Plan:
     realtime, record : instead of lock-step; with the recorder
     output : folder for everything that is made
     json : also write the result's rows here
+    scenario : file, or name of one of the package's, instead of the cycle; its car and friction are the plan's then
     """
 
     cycle: str
@@ -77,6 +78,7 @@ class Plan:
     record: bool
     output: Path
     json: Path | None
+    scenario: str = ""
 
 
 class Loaded(NamedTuple):
@@ -182,8 +184,8 @@ def environment(output: Path, domain: int) -> dict[str, str]:
     }
 
 
-def drive_over_dds(plan: Plan, loaded: Loaded) -> Outcome:
-    """Start the nodes, follow the drive, stop them, read what they left."""
+def drive_over_dds(plan: Plan, name: str) -> Outcome:
+    """Start the nodes, follow the drive, stop them, read what they left; `name` is what progress calls it."""
     vehicle_file = str(resolve(plan.vehicle).absolute())
     common = {"vehicle_file": vehicle_file, "idle_drive": plan.idle_drive, "lockstep": not plan.realtime}
     common |= {"rate_hz": plan.rate_hz, "friction": plan.friction}
@@ -222,6 +224,7 @@ def drive_over_dds(plan: Plan, loaded: Loaded) -> Outcome:
                 {
                     **common,
                     "cycle_file": _absolute(plan.cycle),
+                    "scenario_file": _absolute(plan.scenario) if plan.scenario else "",
                     "initial_soc": plan.soc,
                     "until_s": plan.until_s,
                     "wait_for_recorder": plan.record,
@@ -233,7 +236,7 @@ def drive_over_dds(plan: Plan, loaded: Loaded) -> Outcome:
             stdout=subprocess.PIPE,
         )
         others = [child for child in (recorder, power_manager) if child]
-        follow(simulator, others, loaded.cycle.name)
+        follow(simulator, others, name)
         # The recorder last: it takes what the power manager says in the end, too.
         power_manager.interrupt()
         if recorder:

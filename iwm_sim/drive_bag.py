@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from collections import Counter
 from collections.abc import Mapping
@@ -101,7 +102,7 @@ def with_decisions(run: Run, bag: DriveBag) -> Run:
     known = at >= 0
     for column, name in enumerate(LAW_COLUMNS):
         series[known, COLUMNS.index(name)] = bag.decisions[at[known], column]
-    return Run(run.dt_s, series, run.final)
+    return dataclasses.replace(run, series=series)
 
 
 def _layout(path: Path, kind: str, data: bytes) -> tuple[np.ndarray, int]:

@@ -84,12 +84,12 @@ def _has_stopped(d: Driven) -> bool:
 
 
 def stopping_distance_m(d: Driven) -> float:
-    """Way from the first braking demand to standstill; infinite if the car does not stop."""
+    """Way along the road from the first braking demand to standstill; infinite if the car does not stop."""
     if not _has_stopped(d):
         return math.inf
     end = _stopped(d)
-    after = d.run.final.distance_m if end == len(d.run.series) else d["distance_m"][end]
-    return float(abs(after - d["distance_m"][d.braking]))
+    after = d.run.final.x_m if end == len(d.run.series) else d["x_m"][end]
+    return float(abs(after - d["x_m"][d.braking]))
 
 
 def stopping_time_s(d: Driven) -> float:
@@ -191,13 +191,21 @@ def _jump(d: Driven) -> int:
 
 
 def rise_after_jump_s(d: Driven) -> float:
-    """Time from the front axle's arrival on a better road to 90 % of its deceleration."""
+    """Time from the front axle's arrival on another road until 90 % of that road's deceleration is there to stay.
+
+    To stay until the car is slower than 15 km/h; infinite if that is never so, or there is no other road.
+    """
     start = _jump(d)
     if start >= len(d.run.series):
         return math.inf
-    wanted = 0.9 * np.minimum(_asked_mps2(d)[start:], GRAVITY_MPS2 * d["road_fl"][-1])
-    there = np.flatnonzero(_given_mps2(d)[start:] >= wanted)
-    return float(there[0] * d.run.dt_s) if there.size else math.inf
+    speed = np.maximum(np.abs(d["speed_mps"][start:]), d.vehicle.driver.power_speed_floor_mps)
+    asked = np.maximum(-d["power_demand_w"][start:], 0.0) / (d.vehicle.chassis.mass_kg * speed)
+    wanted = 0.9 * np.minimum(asked, GRAVITY_MPS2 * d["road_fl"][-1])
+    fast = speed > RATE_TO_MPS
+    short = np.flatnonzero(fast & (_given_mps2(d)[start:] < wanted))
+    if not fast.any() or (short.size and not fast[short[-1] + 1 :].any()):
+        return math.inf
+    return float((short[-1] + 1) * d.run.dt_s) if short.size else 0.0
 
 
 def _steering_deg(d: Driven) -> FloatArray:

@@ -56,6 +56,11 @@ class RoadResult(NamedTuple):
         """Whether all requirements are met."""
         return all(check.holds for check in self.checked)
 
+    @property
+    def values(self) -> dict[str, float | None]:
+        """What was measured, by name; None for what never happened, since JSON knows no infinity."""
+        return {check.bound.measure: check.value if math.isfinite(check.value) else None for check in self.checked}
+
 
 def controller_of(scenario: Scenario, settings: Settings | None = None, policies: str = "policies") -> Controller:
     """The power manager as the node starts it, for the scenario's car and the friction it is told."""
@@ -127,7 +132,11 @@ def drive_scenario(
 
 def check_scenario(scenario: Scenario, settings: Settings | None = None) -> RoadResult:
     """Drive a scenario and compare what comes out with what it requires."""
-    run = drive_scenario(scenario, controller_of(scenario, settings))
+    return checked_run(scenario, drive_scenario(scenario, controller_of(scenario, settings)), settings)
+
+
+def checked_run(scenario: Scenario, run: Run, settings: Settings | None = None) -> RoadResult:
+    """Compare a run of a scenario, wherever it was driven, with what the scenario requires."""
     names = [bound.measure for bound in scenario.require]
     healthy = None
     if not OF_HEALTHY.keys().isdisjoint(names):

@@ -8,6 +8,7 @@ this command says whether it did. Equal distribution, driven in one process, sta
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import signal
 import sys
@@ -19,6 +20,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from iwm_power_manager import files, kernel_cache
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
@@ -27,6 +29,9 @@ from iwm_sim import metrics
 from iwm_sim.closed_loop import Run
 from iwm_sim.dds_drive import REFERENCE, Loaded, Outcome, Plan, closed_loop_run, compare, drive_over_dds, load
 from iwm_sim.processes import ChildError
+from iwm_sim.road_report import text
+from iwm_sim.road_run import checked_run
+from iwm_sim.scenario import load_scenario
 from iwm_sim.study.drive_page import Driven, DriveRow, drive_page, row
 from iwm_sim.study.report import format_value as shown
 from iwm_sim.study.report import write_page
@@ -47,6 +52,9 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--cycle", default="config/cycles/nycc.csv", help="drive cycle, CSV")
+    parser.add_argument(
+        "--scenario", default="", metavar="YAML", help="scenario instead of cycle, vehicle, friction and charge"
+    )
     parser.add_argument("--vehicle", default="config/vehicles/jalalmaab_2015.yaml", help="vehicle, YAML")
     parser.add_argument("--policy", default="policies", help="policy file, or folder with a bank of them")
     parser.add_argument(
@@ -80,6 +88,7 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
         record=not given.no_record,
         output=given.output or Path("runs") / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"),
         json=given.json,
+        scenario=given.scenario,
     )
 
 
@@ -112,13 +121,10 @@ def _terminated(_number: int, _frame: Any) -> NoReturn:
 
 def run(plan: Plan) -> int:
     """Do all of it; returns the exit code: 1 if the bag lacks anything that was published."""
+    if plan.scenario:
+        return run_scenario(plan)
     loaded = load(plan)
-    try:
-        (plan.output / "log").mkdir(parents=True)
-    except OSError as error:
-        raise ConfigError(
-            plan.output, "", f"cannot be created: {error.strerror}", "a folder that is not there yet"
-        ) from None
+    _make_output(plan)
     vehicle = loaded.vehicle
     print(f"{vehicle.name} on {loaded.cycle.name}, friction {plan.friction:g}, idle drive {vehicle.idle_drive}")
     if kernel_cache.is_empty():
@@ -126,7 +132,7 @@ def run(plan: Plan) -> int:
     alone = closed_loop_run(plan, loaded)
     reference = closed_loop_run(plan, loaded, equal=True)
 
-    outcome = drive_over_dds(plan, loaded)
+    outcome = drive_over_dds(plan, loaded.cycle.name)
     remarks = outcome.remarks
     driven_run = outcome.run
     if not plan.realtime:
@@ -135,6 +141,32 @@ def run(plan: Plan) -> int:
         if same and np.isnan(driven_run["decided_share"]).all():
             driven_run = alone  # without a bag, the law's decisions of the identical run
     return show(plan, loaded, driven_run, reference, remarks, outcome)
+
+
+def run_scenario(plan: Plan) -> int:
+    """Drive a scenario over DDS and say what it requires; the exit code is 1 if that or the bag falls short."""
+    scenario = load_scenario(plan.scenario, plan.idle_drive or None)
+    plan = dataclasses.replace(plan, vehicle=str(scenario.vehicle.path), friction=scenario.told_friction)
+    load(plan)
+    _make_output(plan)
+    print(f"{scenario.name}: {scenario.about}")
+    outcome = drive_over_dds(plan, scenario.name)
+    result = checked_run(scenario, outcome.run, default_settings(plan.strategy))
+    print(f"\n{text(result)}")
+    for remark in outcome.remarks:
+        print(remark)
+    if plan.json:
+        files.atomic_write(plan.json, json.dumps(result.values, indent=1).encode() + b"\n")
+    return 0 if outcome.complete and result.passed else 1
+
+
+def _make_output(plan: Plan) -> None:
+    try:
+        (plan.output / "log").mkdir(parents=True)
+    except OSError as error:
+        raise ConfigError(
+            plan.output, "", f"cannot be created: {error.strerror}", "a folder that is not there yet"
+        ) from None
 
 
 # --- the result -----------------------------------------------------------------------------------------------------

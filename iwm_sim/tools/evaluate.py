@@ -72,7 +72,7 @@ MODES = {
     "paper": _COMMON | {"--paper", "--cycle", "--idle-drive"},
     "figure": _COMMON | {"--figure", "--plot"},
     "ablation": _COMMON | {"--ablation", "--json"},
-    "scenario": {"--scenario"},
+    "scenario": {"--scenario", "--strategy", "--idle-drive", "--json", "--quiet"},
     "fit_battery": {"--fit-battery", "--vehicle", "--quiet", "--plot", "--json", "--cycle", "--friction"}
     | {"--idle-drive", "--initial-soc"},
 }

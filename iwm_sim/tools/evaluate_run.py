@@ -13,7 +13,7 @@ from pathlib import Path
 
 from iwm_power_manager import __version__
 from iwm_power_manager.control import settings as law_settings
-from iwm_power_manager.control.strategies import DEFAULT_STRATEGY
+from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
@@ -255,8 +255,23 @@ def _fit_battery(options: argparse.Namespace) -> None:
 
 
 def _scenario(options: argparse.Namespace) -> None:
-    for scenario in [load_scenario(name) for name in options.scenario]:
-        print(road_text(check_scenario(scenario)), flush=True)
+    """Each scenario with each strategy: what comes out, beside what is required."""
+    idle_drive = (options.idle_drive or [""])[0] or None
+    scenarios = [load_scenario(name, idle_drive) for name in dict.fromkeys(options.scenario)]
+    strategies = list(dict.fromkeys(options.strategy or [DEFAULT_STRATEGY]))
+    for strategy in strategies:
+        if strategy not in drivable():
+            raise ConfigError("arguments", "--strategy", f"{strategy} drives no scenario", ", ".join(drivable()))
+    rows = []
+    for scenario in scenarios:
+        for strategy in strategies:
+            result = check_scenario(scenario, law_settings.default_settings(strategy))
+            if not options.quiet:
+                print(f"{strategy}\n{road_text(result)}", flush=True)
+            made = {"scenario": scenario.name, "strategy": strategy, "passed": result.passed}
+            rows.append(made | {"values": result.values})
+    if options.json:
+        atomic_write(options.json, (json.dumps(rows, indent=1, allow_nan=False) + "\n").encode())
 
 
 _RUN = {

@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if options.page:
             atomic_write(options.page, page(results, options.strategy).encode())
         if options.json:
-            values = {r.scenario.name: {c.bound.measure: c.value for c in r.checked} for r in results}
+            values = {result.scenario.name: result.values for result in results}
             atomic_write(options.json, (json.dumps(values, indent=2) + "\n").encode())
     except IwmError as error:
         print(f"roads: {error}", file=sys.stderr)

@@ -287,6 +287,11 @@ def test_commands_that_stop_leave_motors_off_and_brakes_at_the_pedal(stand_in) -
     [
         ({"cycle_file": "/nowhere/cycle.csv"}, "/nowhere/cycle.csv: cannot be read"),
         ({"vehicle_file": "/nowhere/car.yaml"}, "/nowhere/car.yaml: cannot be read"),
+        ({"scenario_file": "/nowhere/road.yaml"}, "/nowhere/road.yaml: cannot be read"),
+        (
+            {"scenario_file": "demand_lost", "lockstep": "true"},
+            "faults: lose messages, and lock-step waits for each; allowed: lockstep: false",
+        ),
         ({"friction": 7.0}, "parameter friction: 7.0 is not allowed; allowed: 0.05 to 1.5"),
         ({"friction": ".nan"}, "parameter friction: nan is not allowed"),
         ({"rate_hz": "fast"}, "parameter rate_hz: 'fast' is not allowed"),
@@ -391,3 +396,18 @@ def test_every_parameter_has_a_description_and_every_number_a_range() -> None:
         assert spec.description.endswith("."), spec.name
         if isinstance(spec.default, float):
             assert np.isfinite([spec.low, spec.high]).all(), spec.name
+
+
+def test_a_scenario_is_driven_as_its_file_says(tmp_path: Path, stand_in: Callable[..., StandIn]) -> None:
+    road = tmp_path / "split.yaml"
+    road.write_text(
+        "format: 1\nabout: A stop on a split road.\nstart: {speed_mps: 5.0}\n"
+        "demand: [{from_s: 0.1, brake: 0.2}]\nsteering: lane\n"
+        "road: {friction: [{from_m: -10, left: 0.2, right: 0.9}], grade: 0.01}\n"
+        "until: {time_s: 20.0, standstill: true}\n"
+    )
+    run, _ = stand_in(scenario_file=road, rate_hz=50.0).run()
+    assert run.final.speed_mps == 0.0
+    assert 1.0 < run.final.distance_m < 15.0
+    assert run.road is not None
+    assert set(run.road[0, -6:-2]) == {0.2, 0.9}

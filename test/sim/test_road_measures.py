@@ -38,7 +38,7 @@ def braked(deceleration=5.0, speed=20.0, given=1.0, **more):
     s = np.concatenate(([0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * DT)))
     demand = np.where(t >= 1.0, -MASS * deceleration * np.maximum(v, 1.0), 0.0)
     acceleration = np.concatenate((np.diff(v) / DT, [0.0]))
-    columns = {"speed_mps": v, "distance_m": s, "power_demand_w": demand, "acceleration_mps2": acceleration}
+    columns = {"speed_mps": v, "distance_m": s, "x_m": s, "power_demand_w": demand, "acceleration_mps2": acceleration}
     return made(len(t) * DT, **(columns | more))
 
 
@@ -62,7 +62,7 @@ def test_without_a_stop_or_a_demand_there_is_no_distance():
 
 
 def test_a_run_that_ends_at_standstill_has_stopped():
-    d = made(1.0, {"distance_m": 7.0}, speed_mps=1.0, power_demand_w=-1.0)
+    d = made(1.0, {"x_m": 7.0}, speed_mps=1.0, power_demand_w=-1.0)
     assert m.stopping_distance_m(d) == 7.0
 
 
@@ -119,6 +119,15 @@ def test_after_a_jump_braking_grows_within_a_time():
     )
     assert m.rise_after_jump_s(d) == pytest.approx(0.25)
     assert m.rise_after_jump_s(braked()) == math.inf
+
+
+def test_after_a_jump_braking_that_falls_back_has_not_grown_yet():
+    t = np.arange(0.0, 3.0, DT)
+    decel = np.where((t < 1.0) | ((t > 1.1) & (t < 1.4)), 0.2 * 9.81, 0.9 * 9.81)
+    changes = {f"road_{wheel}": np.where(t < 1.0, 0.2, 0.9) for wheel in ("fl", "fr", "rl", "rr")}
+    common = {"speed_mps": 30.0 - 2.0 * t, "power_demand_w": -MASS * 12.0 * 30.0, **changes}
+    assert m.rise_after_jump_s(made(3.0, acceleration_mps2=-decel, **common)) == pytest.approx(0.4, abs=0.02)
+    assert m.rise_after_jump_s(made(3.0, acceleration_mps2=-1.0, **common)) == math.inf
 
 
 def test_hands_lane_and_yaw():

@@ -206,3 +206,26 @@ def test_the_battery_fit_prints_its_estimates_and_draws(hill, tmp_path, capsys):
     assert "0.063 ohm" in capsys.readouterr().out
     assert picture.read_text().lstrip().startswith("<?xml")
     assert json.loads(out.read_text())["plant"]["resistance_ohm"] > 0.0
+
+
+def test_scenarios_are_driven_with_each_strategy_and_say_what_they_require(tmp_path, capsys):
+    scenario = tmp_path / "short_stop.yaml"
+    scenario.write_text(
+        "format: 1\nabout: A short stop.\nstart: {speed_mps: 5.0}\ndemand: [{from_s: 0.1, brake: 0.5}]\n"
+        "road: {friction: 0.9}\nuntil: {time_s: 4.0, standstill: true}\n"
+        "require: {stopping_distance_m: {at_most: 20.0}, stopping_time_s: {at_most: 0.1}}\n"
+    )
+    rows = tmp_path / "rows.json"
+    given = ["--scenario", str(scenario), "--strategy", "equal", "instantaneous", "--json", str(rows)]
+    assert evaluate.main(given) == 0
+    out = capsys.readouterr().out
+    assert out.count("FAIL  short_stop: A short stop.") == 2
+    found = json.loads(rows.read_text())
+    assert [row["strategy"] for row in found] == ["equal", "instantaneous"]
+    assert not found[0]["passed"]
+    assert found[0]["values"]["stopping_distance_m"] < 20.0
+
+
+def test_a_strategy_that_knows_the_future_drives_no_scenario(capsys):
+    assert evaluate.main(["--scenario", "split_stop", "--strategy", "preview"]) == 2
+    assert "preview drives no scenario" in capsys.readouterr().err
