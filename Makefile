@@ -62,7 +62,7 @@ mutation: setup-dev  ## Mutate the same modules: do the tests notice?
 	@$(BIN)/python scripts/mutation $(ARGS)
 
 ##@ Parts
-.PHONY: lint type format build clean setup-run setup-dev help
+.PHONY: lint type format sbom build clean setup-run setup-dev help
 lint: setup-dev  ## ruff: style, docstrings, likely mistakes
 	@$(BIN)/ruff check .
 
@@ -72,11 +72,15 @@ type: setup-dev  ## mypy, strict
 format: setup-dev  ## Reformat the sources
 	@$(BIN)/ruff check --fix . && $(BIN)/ruff format .
 
+sbom: setup-dev  ## What a user's installation is made of, as a CycloneDX list: sbom.cdx.json
+	@cat requirements/{build,base,ros}.txt | $(BIN)/cyclonedx-py requirements - --output-reproducible --of JSON -o sbom.cdx.json
+	@echo "sbom.cdx.json: $$(grep -c '"purl"' sbom.cdx.json) components"
+
 build: setup-dev  ## colcon build into build/ and install/
 	@scripts/colcon_build
 
 clean:  ## Remove what was built, logged or cached here (.venv stays)
-	@rm -rf build install log dist .pytest_cache .hypothesis .mypy_cache .ruff_cache .coverage .coverage.* htmlcov *.egg-info
+	@rm -rf build install log dist .pytest_cache .hypothesis .mypy_cache .ruff_cache .coverage .coverage.* htmlcov *.egg-info sbom.cdx.json
 	@find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
 
 setup-run:

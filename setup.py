@@ -76,6 +76,7 @@ setup(
     data_files=shared_files(),
     install_requires=[
         "jinja2",
+        "apsw",
         "lz4",
         "matplotlib",
         "mcap",

@@ -97,15 +97,11 @@ class SqliteSource:
             ext: Any = found.ext
             encoding = "" if found.msgdef.format.name == "NONE" else f"ros2{found.msgdef.format.name.lower()}"
             profiles = tuple(Qos.of_rosbags(profile) for profile in ext.offered_qos_profiles)
-            self._topics[found.id] = Topic(
-                found.topic,
-                found.msgtype,
-                found.msgdef.data,
-                found.digest or "",
-                profiles,
-                encoding,
-                ext.serialization_format,
-            )
+            texts = (found.topic, found.msgtype, found.msgdef.data, found.digest or "", ext.serialization_format)
+            if not isinstance(found.id, int) or not all(isinstance(text, str) for text in texts):
+                raise BagError("a topic is described by something else than text")
+            name, msgtype, definition, digest, serialization = texts
+            self._topics[found.id] = Topic(name, msgtype, definition, digest, profiles, encoding, serialization)
             self.counts[found.id] = found.msgcount
         if reader.metadata.message_count:
             self.start_ns, self.end_ns = reader.metadata.start_time, reader.metadata.end_time - 1

@@ -141,6 +141,17 @@ def test_a_query_that_takes_too_long_is_ended(tmp_path: Path, monkeypatch: pytes
     assert "interrupted" in damage[0].lower()
 
 
+def test_a_topic_that_is_described_by_no_text_is_damage(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(5))
+    with sqlite3.connect(folder / "a_0.db3") as database:
+        database.execute("UPDATE topics SET serialization_format = NULL, type = x'ff' WHERE id = 1")
+    database.close()
+    count, damage = contents(folder)
+    assert count == 15
+    assert "described by something else than text" in damage[0]
+    assert recover(folder).files[0].message_count == 15
+
+
 @pytest.mark.parametrize("suffix", ["?mode=rwc", "#a", "%2e"])
 def test_a_name_that_is_an_address_opens_the_file_and_no_other(tmp_path: Path, suffix: str) -> None:
     folder = foreign.write_sqlite(tmp_path / f"bag{suffix}", foreign.drive(5))

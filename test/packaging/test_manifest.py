@@ -29,6 +29,7 @@ ROS_MODULES = {
 #: Other imports, and the rosdep key that brings them.
 ROSDEP_KEYS = {
     "jinja2": "python3-jinja2",
+    "apsw": "python3-rosbags-pip",
     "lz4": "python3-rosbags-pip",
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",
@@ -142,3 +143,12 @@ def test_no_tracked_file_names_a_place_on_the_machine_it_was_written_on() -> Non
         if name and (ROOT / name).is_file() and home.search((ROOT / name).read_bytes())
     ]
     assert not guilty
+
+
+@pytest.mark.parametrize("group", ["build", "base", "ros", "test", "dev"])
+def test_every_pinned_package_has_the_hashes_of_its_files(group: str) -> None:
+    text = (ROOT / "requirements" / f"{group}.txt").read_text().replace("\\\n", " ")
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    assert lines
+    for line in lines:
+        assert re.fullmatch(r"[\w.-]+==\S+( ;.*?)?( +--hash=sha256:[0-9a-f]{64})+\s*", line), line[:80]
