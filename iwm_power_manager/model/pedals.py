@@ -15,6 +15,9 @@ from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.parameters import VehicleParams
 
+#: Ways to say a demand that is no power.
+PEDAL_TRAVEL, FORCE, TORQUE, ACCELERATION = range(4)
+
 
 @kernel
 def full_power_w(speed_mps: float, vehicle: VehicleParams) -> float:
@@ -61,3 +64,23 @@ def acceleration_power_w(acceleration_mps2: float, speed_mps: float, vehicle: Ve
     moving = min(speed_mps / vehicle.driver.power_speed_floor_mps, 1.0)
     force = equivalent_mass_kg(vehicle) * acceleration_mps2 + moving * road_load_n(speed_mps, 0.0, vehicle.chassis)
     return force_power_w(force, speed_mps, vehicle)
+
+
+@kernel
+def demand_power_w(kind: int, value: float, brake: float, speed_mps: float, vehicle: VehicleParams) -> float:
+    """Power of a demand that is said otherwise, W; braking negative.
+
+    Parameters
+    ----------
+    kind : PEDAL_TRAVEL, FORCE, TORQUE or ACCELERATION
+    value : travel of the accelerator 0..1, N, N m or m/s2
+    brake : travel of the brake pedal 0..1, where `kind` is PEDAL_TRAVEL
+    speed_mps : of the car, >= 0
+    """
+    if kind == FORCE:
+        return force_power_w(value, speed_mps, vehicle)
+    if kind == TORQUE:
+        return torque_power_w(value, speed_mps, vehicle)
+    if kind == ACCELERATION:
+        return acceleration_power_w(value, speed_mps, vehicle)
+    return pedal_power_w(value, brake, speed_mps, vehicle)

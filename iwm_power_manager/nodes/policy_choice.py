@@ -57,6 +57,13 @@ class Policies:
             f"strategy: {strategy} needs a policy; {self._missing}" if _needs_policy(strategy) and self._missing else ""
         )
 
+    def description(self) -> str:
+        """Strategy and policy in use, in a few words."""
+        if self._chosen is None:
+            return f"strategy {self.strategy}, no policy"
+        policy = self._chosen
+        return f"strategy {self.strategy}, policy {policy.checksum[:12]} for friction {policy.friction:g}"
+
     def status(self) -> diagnostics.Status:
         """Identity of the policy in use, and whether its file is still the one that was loaded."""
         values = {"strategy": self.strategy, "policies": str(len(self._bank))}

@@ -7,16 +7,18 @@ clock, the lifecycle and nothing else. See docs/interface.md for topics and para
 
 from __future__ import annotations
 
+import os
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -25,32 +27,32 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import JointState
+from rclpy.task import Future
 
-from iwm_power_manager.control.controller import Controller, ControllerLimits
+from iwm_power_manager.control.controller import Controller
 from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS
 from iwm_power_manager.control.monitor import BatteryReading, InputMonitor, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.control.stepping import Lockstep, RealTime, Taken
-from iwm_power_manager.control.thresholds import input_limits, supervision_limits
-from iwm_power_manager.errors import BagError, ConfigError, IwmError
+from iwm_power_manager.errors import IwmError
 from iwm_power_manager.nodes import power_manager_config as config
+from iwm_power_manager.nodes.announcements import Announcements, input_topics
 from iwm_power_manager.nodes.demand_log import DemandLog
-from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
+from iwm_power_manager.nodes.policy_choice import Policies
 from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport
+from iwm_power_manager.nodes.preparation import Preparation, Prepared
 from iwm_power_manager.ros import diagnostics, ending, messages, qos, realtime
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.interruption import Interruption
-from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
-from iwm_power_manager.share import resolve
-from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, DEMANDS, PEDALS, SignalMapping, Source, load_mapping
-from iwm_power_manager.signals.readings import Assembly, DemandReading, FrictionReading, TopicReader, topic_readers
-from iwm_power_manager.signals.types import Types, types_of
-from iwm_power_manager.vehicle import Vehicle, load_vehicle
+from iwm_power_manager.ros.matching import mismatched_publishers, mismatched_subscribers
+from iwm_power_manager.ros.parameters import KeepsItsValues, ParameterError, check_change, declare
+from iwm_power_manager.signals.cdr import MessageWriter
+from iwm_power_manager.signals.commands import FRICTION, MOTOR, CommandWriter
+from iwm_power_manager.signals.contract import JOINT_STATE, NODE_STATE
+from iwm_power_manager.signals.mapping import DEMANDS, PEDALS
+from iwm_power_manager.signals.readings import DemandReading, FrictionReading, TopicReader, joint_state_writer
 
-_COMMANDS = (messages.WHEEL_TORQUE_COMMAND, messages.FRICTION_BRAKE_COMMAND)
-_OUTPUTS = (*_COMMANDS, messages.POWER_MANAGER_STATE)
 #: The queue of each stamped input of a lock-step set.
 _QUEUES: dict[type, int] = {SpeedReading: SPEED, JointReading: WHEELS, BatteryReading: BATTERY}
 #: How often, and how far apart, the rest of a set is looked for once its demand is there; later the watchdog looks.
@@ -66,7 +68,7 @@ _CHANGE_PERIOD_S = 0.1
 _ACKNOWLEDGE_S = 0.2
 
 
-class PowerManager(LifecycleNode):
+class PowerManager(KeepsItsValues, LifecycleNode):
     """The managed node.
 
     Raises
@@ -102,14 +104,28 @@ class PowerManager(LifecycleNode):
         self._wheel_names: tuple[str, ...] = tuple(self._values["wheel_names"])
         self._period_s = 1.0 / self._values["rate_hz"]
         self._last_step_steady_s = 0.0
-        self._answer: dict[str, JointState] | None = None
+        self._answer: list[tuple[str, bytes]] | None = None
         self._readers: dict[str, TopicReader] = {}
         self._demand_reader: TopicReader | None = None
+        self._commands: dict[str, CommandWriter] = {}
+        self._command_topics: list[str] = []
+        self._write_state: MessageWriter | None = None
+        self._topics: dict[str, tuple[str, ...]] = {}
+        self._msgtypes: dict[str, str] = {}
+        self._mismatches: dict[str, str] = {}
+        self._preparation: Preparation | None = None
+        self._prepared: Future | None = None
+        self._starting = False
+        self.start_failed = False
+        self._says = Announcements(self.get_logger())
         # rclpy ends a transition that the present state does not have in an exception; its client would wait forever.
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._change_state_if_possible
+        # It waits for what is prepared; in the node's own group everything else would wait with it.
+        self._service_change_state.callback_group = MutuallyExclusiveCallbackGroup()
+        self._service_change_state.callback_group.add_entity(self._service_change_state)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._report = PowerManagerReport(self.get_name(), self._wheel_names, None)
+        self._report = PowerManagerReport(self.get_fully_qualified_name(), self._wheel_names, None)
         self._report_due = False
         self._changes = ChangeDetector(_CHANGE_PERIOD_S)
         self.create_timer(_REPORT_PERIOD_S, self._on_report_timer)
@@ -118,11 +134,11 @@ class PowerManager(LifecycleNode):
     # Lifecycle
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Load and verify vehicle and policy, warm the law, then appear on the topics."""
-        self._values = {name: self.get_parameter(name).value for name in config.BY_NAME}
+        """Take over what was prepared (or prepare it now), then appear on the topics."""
+        self._values = self._present_values()
         self._fault = ""
         try:
-            self._build()
+            self._adopt(self._take_preparation())
         except IwmError as error:
             self._fault = str(error)
             self.get_logger().error(self._fault)
@@ -134,6 +150,9 @@ class PowerManager(LifecycleNode):
             self.get_logger().warning(f"the system refused {what}")
         if self._values["gc_off_path"]:
             realtime.stop_automatic_collection()
+        rate = "in lock-step" if self._lockstep else f"{self._values['rate_hz']:g} Hz"
+        resolved = [self.resolve_topic_name(topic) for topic in self._command_topics]
+        self._says.interface(self._topics, resolved, rate)
         return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -145,6 +164,8 @@ class PowerManager(LifecycleNode):
         self._start_over()
         result = super().on_activate(state)
         self._active = True
+        self._says.activated()
+        self.get_logger().info("active")
         self._last_step_steady_s = time.monotonic()
         if not self._lockstep:
             self._step_timer = self.create_timer(self._period_s, self._on_step_timer)
@@ -153,6 +174,7 @@ class PowerManager(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Command zero torque, then stop commanding."""
         self._stop_commanding()
+        self.get_logger().info("inactive: zero torque was commanded")
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -175,12 +197,41 @@ class PowerManager(LifecycleNode):
         self.get_logger().error("a transition failed; the node is unconfigured again")
         return TransitionCallbackReturn.SUCCESS
 
-    def start(self) -> bool:
-        """Configure and activate; False if that was refused."""
-        return (
-            self.trigger_configure() == TransitionCallbackReturn.SUCCESS
-            and self.trigger_activate() == TransitionCallbackReturn.SUCCESS
-        )
+    def start(self) -> None:
+        """Configure and activate as soon as what that needs is prepared; `start_failed` if it is refused."""
+        self._starting = True
+        self._prepare()
+
+    def _go_on_starting(self) -> None:
+        """The next step on the way to active, once it is possible."""
+        if not self.preparing:
+            self._starting = False
+            self.start_failed = not (
+                self.trigger_configure() == TransitionCallbackReturn.SUCCESS
+                and self.trigger_activate() == TransitionCallbackReturn.SUCCESS
+            )
+
+    @property
+    def preparing(self) -> bool:
+        """A thread is loading and compiling."""
+        return self._preparation is not None and self._preparation.running
+
+    def _present_values(self) -> dict[str, Any]:
+        return {name: self.get_parameter(name).value for name in config.BY_NAME}
+
+    def _prepare(self) -> Future:
+        """Begin to prepare, unless that is going on; what is returned is done when it is over."""
+        if self._prepared is None:
+            done = self._prepared = Future(executor=self.executor)
+            self._preparation = Preparation(self._present_values(), lambda: done.set_result(None))
+        return self._prepared
+
+    def _take_preparation(self) -> Prepared:
+        """What was prepared, of the parameters as they are now."""
+        preparation, self._preparation, self._prepared = self._preparation, None, None
+        if preparation is None or preparation.values != self._values:
+            preparation = Preparation(self._values, lambda: None)
+        return preparation.result()
 
     def stop(self) -> None:
         """Deactivate, if active."""
@@ -193,94 +244,61 @@ class PowerManager(LifecycleNode):
         self.get_logger().fatal(f"zero torque and inactive: {problem}")
         self.stop()
 
-    def _change_state_if_possible(
+    async def _change_state_if_possible(
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
-        possible = {(found[0], found[1]) for found in self._state_machine.available_transitions}
         wanted = request.transition
-        by_label = bool(wanted.label)
-        if not any(wanted.label == label if by_label else wanted.id == number for number, label in possible):
-            name = wanted.label if by_label else wanted.id
+        configure = wanted.label == "configure" if wanted.label else wanted.id == Transition.TRANSITION_CONFIGURE
+        if configure and self._is_possible(wanted):
+            await self._prepare()  # other services are answered meanwhile
+        if not self._is_possible(wanted):
+            name = wanted.label or wanted.id
             self.get_logger().warning(f"there is no transition {name} from state {self._lifecycle_state()}")
             response.success = False
             return response
         return self._change_state(request, response)
 
-    def _build(self) -> None:
-        values = self._values
-        vehicle = load_vehicle(resolve(values["vehicle_file"]), values["idle_drive"] or None)
-        policies = choose_policies(
-            values["policy_file"], values["strategy"], values["fallback"], values["rule"], vehicle
-        )
-        if policies.fallback_reason:
-            self.get_logger().warning(f"runs equal split instead of {values['strategy']}: {policies.fallback_reason}")
-        thresholds = config.thresholds_of(values)
-        limits = ControllerLimits(
-            input_limits(thresholds, vehicle.params.front.wheel.radius_m, by_clock=not self._lockstep),
-            None if self._lockstep else config.age_limits_s(values),
-            supervision_limits(thresholds),
-        )
+    def _is_possible(self, wanted: Transition) -> bool:
+        possible = {(found[0], found[1]) for found in self._state_machine.available_transitions}
+        return any(wanted.label == label if wanted.label else wanted.id == number for number, label in possible)
+
+    def _adopt(self, prepared: Prepared) -> None:
+        """Drive with what was prepared."""
+        self._says.prepared(prepared)
+        values, signals = self._values, prepared.mapping
         self._wheel_names = tuple(values["wheel_names"])
         self._period_s = 1.0 / values["rate_hz"]
-        self._controller = Controller(
-            vehicle.params,
-            self._wheel_names,
-            limits,
-            config.law_settings(values, policies.strategy),
-            policies.table(values["friction"]),
-            values["friction"],
-        )
+        self._controller, self._policies = prepared.controller, prepared.policies
+        self._readers, self._commands = prepared.readers, prepared.commands
+        sinks = [sink for found in signals.commands.values() for sink in found]
+        self._command_topics = [sink.topic for sink in sinks]
+        self._write_state = joint_state_writer(SIGNAL_NAMES, "position")
+        resolve_name = self.resolve_topic_name
+        self._topics = {name: tuple(map(resolve_name, topics)) for name, topics in input_topics(signals).items()}
+        self._msgtypes = {resolve_name(topic): reader.read.types.name for topic, reader in self._readers.items()}
+        self._msgtypes |= {resolve_name(sink.topic): sink.type for sink in sinks}
+        self._msgtypes[resolve_name(NODE_STATE)] = JOINT_STATE
         self._stepper = (
             Lockstep(self._controller, self._period_s)
             if self._lockstep
-            else RealTime(self._controller, self._period_s, thresholds)
+            else RealTime(self._controller, self._period_s, config.thresholds_of(values))
         )
-        self._policies = policies
-        self._readers = self._make_readers(vehicle)
-        # The first call compiles the law or reads it from the cache: seconds that no control step may take.
-        for table in policies.tables():
-            self._controller.policy = table
-            self._controller.step(0, self._period_s)
-        self._controller.policy = policies.table(values["friction"])
-        self._controller.reset()
         if values["demand_log"]:
-            self._demand_log = DemandLog(
-                Path(values["demand_log"]), values["demand_log_period_s"], self._controller.policy
-            )
-        self._report = PowerManagerReport(
-            self.get_name(), self._wheel_names, None if self._lockstep else values["rate_hz"]
-        )
-
-    def _make_readers(self, vehicle: Vehicle) -> dict[str, TopicReader]:
-        """A reader for each topic of the signals file, which can then be subscribed to."""
-        assert self._controller is not None
-        mapping = load_mapping(resolve(self._values["signals_file"]))
-        if self._values["signals_file"] == DEFAULT_MAPPING:
-            mapping = mapping.with_wheel_names(self._wheel_names)
-        monitor = self._controller.monitor
-        assembly = Assembly(self._wheel_names, vehicle.params, lambda: monitor.speed_mps)
-        types = {source.topic: self._types(mapping, source) for found in mapping.sources.values() for source in found}
-        return topic_readers(mapping, types, assembly)
-
-    def _types(self, mapping: SignalMapping, source: Source) -> Types:
-        """Types of a source, which have to be installed for DDS as well."""
-        if not source.type:
-            raise ConfigError(mapping.path, f"{source.key}.type", "is missing: a live signal needs it")
-        try:
-            messages.message_class(source.type)
-            return types_of(source.type)
-        except (ImportError, BagError) as error:
-            raise ConfigError(mapping.path, f"{source.key}.type", f"{source.type} cannot be used: {error}") from None
+            path, period_s = Path(values["demand_log"]), values["demand_log_period_s"]
+            self._demand_log = DemandLog(path, period_s, self._controller.policy)
+        rate_hz = None if self._lockstep else values["rate_hz"]
+        self._report = PowerManagerReport(self.get_fully_qualified_name(), self._wheel_names, rate_hz)
 
     def _create_entities(self) -> None:
+        """Publishers and subscriptions of everything the signals file names, and of the state."""
         profile = qos.profile(lockstep=self._lockstep)
         overrides = {"qos_overriding_options": QoSOverridingOptions.with_default_policies()}
         # What cannot be met is told in the diagnostics; an event handler would be waited for at each step.
         silent = {"event_callbacks": PublisherEventCallbacks(use_default_callbacks=False)}
-        self._publishers_made = {
-            topic: self.create_lifecycle_publisher(JointState, topic, profile, **overrides, **silent)
-            for topic in _OUTPUTS
-        }
+        offered = qos.command_profile(None if self._lockstep else self._period_s)
+        for topic, offer in (*((topic, offered) for topic in self._command_topics), (NODE_STATE, profile)):
+            kind = messages.message_class(self._msgtypes[self.resolve_topic_name(topic)])
+            self._publishers_made[topic] = self.create_lifecycle_publisher(kind, topic, offer, **overrides, **silent)
         for topic, reader in self._readers.items():
             kind = messages.message_class(reader.read.types.name)
             reliability = "reliable" if "reliable" in {source.qos for source in reader.sources} else "best_effort"
@@ -309,6 +327,9 @@ class PowerManager(LifecycleNode):
         self._publishers_made = {}
         self._readers = {}
         self._demand_reader = None
+        self._commands = {}
+        self._command_topics = []
+        self._mismatches = {}
         self._controller = None
         self._stepper = None
         self._policies = None
@@ -326,7 +347,7 @@ class PowerManager(LifecycleNode):
             self.destroy_timer(self._step_timer)
             self._step_timer = None
         self._command_zero()
-        for topic in _COMMANDS:
+        for topic in self._command_topics:
             self._publishers_made[topic].wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
         if self._demand_log and (problem := self._demand_log.write()):
             self.get_logger().error(problem)
@@ -456,14 +477,13 @@ class PowerManager(LifecycleNode):
                 self._publish(self._answer)
             return
         command, numbers = taken.step
-        stamp_ns, names = taken.stamp_ns, self._wheel_names
-        self._answer = {
-            messages.WHEEL_TORQUE_COMMAND: messages.torque_command_message(stamp_ns, names, command.motor_torque_nm),
-            messages.FRICTION_BRAKE_COMMAND: messages.torque_command_message(
-                stamp_ns, names, command.friction_torque_nm
-            ),
-            messages.POWER_MANAGER_STATE: messages.named_numbers_message(stamp_ns, SIGNAL_NAMES, numbers),
-        }
+        stamp_ns = taken.stamp_ns
+        assert self._write_state is not None
+        self._answer = [
+            *self._commands[MOTOR](stamp_ns, command.motor_torque_nm),
+            *self._commands[FRICTION](stamp_ns, command.friction_torque_nm),
+            (NODE_STATE, self._write_state(stamp_ns, numbers)),
+        ]
         if isinstance(self._stepper, RealTime) and not self._stepper.may_send(time.monotonic()):
             return
         self._publish(self._answer)
@@ -471,18 +491,21 @@ class PowerManager(LifecycleNode):
             self._demand_log.note(taken.stamp_ns, numbers)
         self._report.note_step(command, taken.since_s, time.perf_counter() - started_s)
 
-    def _publish(self, answer: Mapping[str, JointState]) -> None:
-        for topic, message in answer.items():
-            self._publishers_made[topic].publish(message)
+    def _publish(self, answer: list[tuple[str, bytes]]) -> None:
+        for topic, data in answer:
+            self._publishers_made[topic].publish(data)
 
     def _command_zero(self) -> None:
-        message = messages.torque_command_message(self._now_ns(), self._wheel_names, _ZERO)
-        for topic in _COMMANDS:
-            self._publishers_made[topic].publish(message)
+        now_ns = self._now_ns()
+        for write in self._commands.values():
+            self._publish(write(now_ns, _ZERO))
 
     # Parameters
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        if self._active and self._values["lock_parameters"]:
+            return SetParametersResult(successful=False, reason="lock_parameters: nothing changes while active")
+
         def together(new: dict[str, Any]) -> str:
             problem = config.check_together(self._values | new)
             if not problem and self._policies and "strategy" in new:
@@ -525,8 +548,12 @@ class PowerManager(LifecycleNode):
     def _watch(self) -> None:
         """Ten times a second of real time: friction, a clock that stands still, reports on change.
 
-        It also wakes the executor often enough for a signal to be noticed.
+        It also wakes the executor often enough for a signal to be noticed, and goes on with the start.
         """
+        if self._preparation is not None:
+            self._says.preparing(self._preparation.elapsed_s)
+        if self._starting:
+            self._go_on_starting()
         controller = self._controller
         stepping = self._active and not self._lockstep
         if self._active and controller:
@@ -541,6 +568,7 @@ class PowerManager(LifecycleNode):
                 self._command_zero()
             elif self._fault and self._stepper is not None and self._stepper.last_ns is not None:
                 self._fault = ""
+            self._says.stepped(controller, self._topics, self._mismatches)
         shown = controller and (controller.supervision.mode, controller.supervision.stale, controller.wheels_lost)
         gate = controller and controller.command and controller.command.gate
         if self._changes.changed((self._active, self._fault, shown, gate), time.monotonic()):
@@ -577,21 +605,23 @@ class PowerManager(LifecycleNode):
         if self._demand_log:
             statuses.append(self._demand_log.status())
         if self._active:
-            counts = {topic: self.count_publishers(topic) for topic in _COMMANDS}
-            others = [f"{topic} has {count} publishers" for topic, count in counts.items() if count > 1]
-            level = diagnostics.ERROR if others else diagnostics.OK
-            statuses.append(
-                diagnostics.Status(
-                    "command topics",
-                    level,
-                    "; ".join(others) or "ok",
-                    {f"{topic}: publishers": str(count) for topic, count in counts.items()},
-                )
-            )
-            unmatched = self._intake.unmatched()
-            if unmatched:
-                message = f"quality of service does not match the publisher's: {', '.join(unmatched)}"
-                statuses.append(diagnostics.Status("input topics", diagnostics.ERROR, message, {}))
+            statuses += self._topic_statuses()
+        return statuses
+
+    def _topic_statuses(self) -> list[diagnostics.Status]:
+        """Who else is on the topics: other commanders, and whoever cannot be connected with."""
+        counts = {topic: self.count_publishers(topic) for topic in self._command_topics}
+        others = [f"{topic} has {count} publishers" for topic, count in counts.items() if count > 1]
+        deaf = mismatched_subscribers(self, self._publishers_made.values(), self._msgtypes)
+        problems = [*others, *(f"{topic}: {why}" for topic, why in deaf.items())]
+        values = {f"{topic}: publishers": str(count) for topic, count in counts.items()}
+        level = diagnostics.ERROR if problems else diagnostics.OK
+        statuses = [diagnostics.Status("command topics", level, "; ".join(problems) or "ok", values)]
+        self._mismatches = mismatched_publishers(self, self._intake.subscriptions(), self._msgtypes)
+        unheard = [f"{topic}: {why}" for topic, why in self._mismatches.items()]
+        if unheard:
+            statuses.append(diagnostics.Status("input topics", diagnostics.ERROR, "; ".join(unheard), {}))
+        self._says.problems([*problems, *unheard])
         return statuses
 
 
@@ -607,22 +637,24 @@ def main(args: list[str] | None = None) -> int:
         check_arguments("power_manager", "Splits the driver's power demand between four motors.", config.SPECS, args)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PowerManager()
-        if not node.get_parameter("autostart").value or node.start():
-            interruption.started = True
-            _spin(node, interruption)
-            code = 0
-        elif interruption.requested:
-            code = 0  # a library has swallowed the KeyboardInterrupt and failed for it
+        interruption.started = True
+        if node.get_parameter("autostart").value:
+            node.start()
+        _spin(node, interruption)
+        code = 1 if node.start_failed and not interruption.requested else 0
     except KeyboardInterrupt:
         code = 0  # ended before it had begun
     except (IwmError, RuntimeError) as error:
         print(f"power_manager: {str(error).splitlines()[0]}", file=sys.stderr)
     finally:
+        compiling = node is not None and node.preparing
         with ending.bounded(code):
             if node is not None:
                 node.stop()
                 node.destroy_node()
                 node = None
+        if compiling:  # its thread would be waited for
+            os._exit(code)
     return code
 
 
@@ -630,7 +662,7 @@ def _spin(node: PowerManager, interruption: Interruption) -> None:
     """Step in time and serve callbacks, until a signal asks to end."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    while not interruption.requested:
+    while not interruption.requested and not node.start_failed:
         try:
             # What else is ready follows each step; where there are none the executor waits.
             executor.spin_once(timeout_sec=0.0 if node.step_when_due() else None)

@@ -59,6 +59,12 @@ SPECS = (
         "to configure, equal runs equal split.",
         choices=("none", "equal"),
     ),
+    Spec(
+        "lock_parameters",
+        False,
+        "While active, refuse every change of a parameter: whoever is on the domain could make it.",
+        change=Change.NEVER,
+    ),
     Spec("autostart", True, "Configure and activate at start, without a lifecycle manager.", change=Change.NEVER),
     Spec(
         "lockstep",
@@ -201,7 +207,6 @@ def thresholds_of(values: Mapping[str, Any]) -> thresholds.Thresholds:
 def parameter_file() -> str:
     """Content of `config/nodes/power_manager.yaml`."""
     return yaml_text(
-        "power_manager",
         SPECS,
         "Parameters of the power manager, all of them, with their defaults. Ranges: docs/interface.md, or "
         "`ros2 param describe`. Written by scripts/update_interface.",

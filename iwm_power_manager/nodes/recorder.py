@@ -304,9 +304,9 @@ class Recorder(Node):
         message.status = [
             DiagnosticStatus(
                 level=level,
-                name=f"{self.get_name()}: recording",
+                name=f"{self.get_fully_qualified_name()}: recording",
                 message=text,
-                hardware_id="",
+                hardware_id=self.get_fully_qualified_name(),
                 values=[KeyValue(key=str(key), value=str(value)) for key, value in values.items()],
             )
         ]

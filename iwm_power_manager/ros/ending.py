@@ -19,8 +19,9 @@ import rclpy
 
 from iwm_power_manager.ros import realtime
 
-#: Leaving takes less than 0.1 s on an idle machine; on one with far too much to do, a second or two.
-LIMIT_S = 5.0
+#: Leaving takes less than 0.1 s on an idle machine; on one with far too much to do, a second or two. Launch waits 5 s
+#: before it calls a node that was asked to end unresponsive.
+LIMIT_S = 3.0
 
 _CLOCK_MONOTONIC, _SIGEV_THREAD = 1, 2
 

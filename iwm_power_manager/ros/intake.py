@@ -79,13 +79,9 @@ class Intake:
             for _ in self.take(topic):
                 pass
 
-    def unmatched(self) -> list[str]:
-        """Topics that have a publisher whose quality of service does not meet the subscription's."""
-        return [
-            topic
-            for topic, subscription in self._subscriptions.items()
-            if subscription.get_publisher_count() == 0 and self._node.count_publishers(topic) > 0
-        ]
+    def subscriptions(self) -> list[Any]:
+        """The subscriptions, for whoever wants to know what they are matched with."""
+        return list(self._subscriptions.values())
 
     def close(self) -> None:
         """Drop all subscriptions."""

@@ -26,7 +26,7 @@ from iwm_power_manager.control.monitor import (
     select_by_name as select_by_name,  # part of this interface
 )
 from iwm_power_manager.signals.contract import *  # noqa: F403 - names of topics and wheels: part of this interface
-from iwm_power_manager.signals.contract import TOPICS
+from iwm_power_manager.signals.contract import TYPES
 
 
 def message_class(msgtype: str) -> type:
@@ -41,7 +41,7 @@ def message_class(msgtype: str) -> type:
 
 
 #: Message type of every topic.
-TOPIC_TYPES: dict[str, type] = {topic.name: message_class(topic.type) for topic in TOPICS}
+TOPIC_TYPES: dict[str, type] = {name: message_class(msgtype) for name, msgtype in TYPES.items()}
 
 _NANOSECONDS = 1_000_000_000
 

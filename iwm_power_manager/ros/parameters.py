@@ -111,12 +111,12 @@ class Spec(NamedTuple):
 
 
 def declare(node: Node, specs: Sequence[Spec]) -> dict[str, Any]:
-    """Declare all parameters, warn of those given that do not exist, and return their values at start.
+    """Declare all parameters and return their values at start.
 
     Raises
     ------
     ParameterError
-        A parameter given at start has the wrong type or a value that is not allowed.
+        A parameter given at start does not exist, has the wrong type or a value that is not allowed.
     """
     values = {}
     for spec in specs:
@@ -132,23 +132,38 @@ def declare(node: Node, specs: Sequence[Spec]) -> dict[str, Any]:
         if problem:
             raise ParameterError(f"parameter {problem}")
         values[spec.name] = _plain(value)
-    for line in _unknown(node, specs):
-        node.get_logger().warning(line)
+    _refuse_unknown(node, specs)
     return values
 
 
-def _unknown(node: Node, specs: Sequence[Spec]) -> list[str]:
-    """A line for each parameter given at start that the node does not have, with the nearest that it has.
-
-    They are no error: a file may give one set of parameters to all nodes (`/**`).
-    """
+def _refuse_unknown(node: Node, specs: Sequence[Spec]) -> None:
+    """A parameter that has no effect was meant to have one: a node does not drive with half of what it was given."""
     known = [spec.name for spec in specs]
-    lines = []
     for name in sorted(set(node._parameter_overrides) - set(known)):
         if not node.has_parameter(name) and not name.startswith(_ROS_PREFIXES):
             near = difflib.get_close_matches(name, known, 1)
-            lines.append(f"parameter {name} is unknown and has no effect" + (f"; is {near[0]} meant?" if near else ""))
-    return lines
+            raise ParameterError(f"parameter {name} is unknown" + (f"; is {near[0]} meant?" if near else ""))
+
+
+class KeepsItsValues:
+    """Mixin of a node: a parameter that is set to the value it has is no change, even of one that may not change.
+
+    So that a node can load what it has dumped, or a file that it was started with.
+    """
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set what differs."""
+        node: Any = super()
+        new = [
+            parameter
+            for parameter in parameter_list
+            if not (node.has_parameter(parameter.name) and _same(node.get_parameter(parameter.name), parameter))
+        ]
+        return node.set_parameters_atomically(new) if new else SetParametersResult(successful=True)
+
+
+def _same(present: Parameter, new: Parameter) -> bool:
+    return present.type_ == new.type_ and bool(_plain(present.value) == _plain(new.value))
 
 
 def check_change(
@@ -181,17 +196,16 @@ def check_change(
     return SetParametersResult(successful=not problem, reason=problem)
 
 
-def yaml_text(node_name: str, specs: Iterable[Spec], introduction: str) -> str:
+def yaml_text(specs: Iterable[Spec], introduction: str) -> str:
     """A parameter file with every parameter at its default, each below its description.
 
     Parameters
     ----------
-    node_name : the node, whatever its namespace
-    specs : its parameters; those with a dot in their names have to stand together
+    specs : the parameters of a node, whatever its name; those with a dot in their names have to stand together
     introduction : first lines, without the comment signs
     """
     lines = [f"# {line}" for line in textwrap.wrap(introduction, _WIDTH)]
-    lines += [f"/**/{node_name}:", "  ros__parameters:"]
+    lines += ["/**:", "  ros__parameters:"]
     group = ""
     for spec in specs:
         parent, _, name = spec.name.rpartition(".")

@@ -1,13 +1,15 @@
 """Quality of service of the topics.
 
 Real time follows Autoware's convention for commands and status: reliable, volatile, keep the last one; a control loop
-wants the newest value, not a queue of old ones. In lock-step every message counts, so the queue is deep enough that
-none can be overwritten while one side is busy.
+wants the newest value, not a queue of old ones. Inputs are asked for best effort, which both kinds of publishers meet.
+Commands offer a deadline and liveliness, so that who obeys them can have DDS tell when they stay away. In lock-step
+every message counts, so the queue is deep enough that none can be overwritten while one side is busy.
 """
 
 from __future__ import annotations
 
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
 REAL_TIME_DEPTH = 1
 LOCKSTEP_DEPTH = 100
@@ -30,3 +32,23 @@ def profile(*, lockstep: bool, depth: int = 0, reliability: str = "reliable") ->
         reliability=RELIABILITIES[reliability],
         durability=DurabilityPolicy.VOLATILE,
     )
+
+
+#: Control periods after which a command is overdue, and after which its node counts as dead.
+DEADLINE_PERIODS, LEASE_PERIODS = 3.0, 10.0
+
+
+def command_profile(period_s: float | None) -> QoSProfile:
+    """Profile of a command topic: reliable, with a deadline and the liveliness of its own writes.
+
+    Parameters
+    ----------
+    period_s : control period; None in lock-step, where a command may take any time
+    """
+    if period_s is None:
+        return profile(lockstep=True)
+    found = profile(lockstep=False)
+    found.deadline = Duration(seconds=DEADLINE_PERIODS * period_s)
+    found.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
+    found.liveliness_lease_duration = Duration(seconds=LEASE_PERIODS * period_s)
+    return found

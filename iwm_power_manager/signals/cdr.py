@@ -64,6 +64,11 @@ def steps_of(path: str) -> list[str | int] | None:
     return steps
 
 
+def names_path(field: str) -> str:
+    """Path of the field `name` beside a field, as a JointState has it."""
+    return ".".join([*field.split(".")[:-1], "name"])
+
+
 def field_kind(types: Types, path: str) -> str:
     """What a field is: "number", "array", "message", "text", "texts", or "" if it does not exist."""
     from rosbags.interfaces import Nodetype

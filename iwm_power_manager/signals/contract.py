@@ -24,6 +24,8 @@ ROAD_FRICTION = "road_friction"
 WHEEL_TORQUE_COMMAND = "wheel_torque_command"
 FRICTION_BRAKE_COMMAND = "friction_brake_command"
 POWER_MANAGER_STATE = "power_manager/state"
+#: The same as the node itself names it: private, so that a renamed node has one of its own.
+NODE_STATE = "~/state"
 DIAGNOSTICS = "/diagnostics"
 CLOCK = "/clock"
 
@@ -127,7 +129,7 @@ TOPICS = (
         "",
     ),
     Topic(
-        POWER_MANAGER_STATE,
+        NODE_STATE,
         JOINT_STATE,
         "out",
         "power_manager",
@@ -159,4 +161,42 @@ TOPICS = (
         "",
     ),
 )
-BY_NAME = {topic.name: topic for topic in TOPICS}
+#: Message type of every topic, and of the state by the name that others know it by.
+TYPES = {topic.name: topic.type for topic in TOPICS} | {POWER_MANAGER_STATE: JOINT_STATE}
+
+
+class Service(NamedTuple):
+    """One service: node, private name, type, and what it is for."""
+
+    node: str
+    name: str
+    type: str
+    meaning: str
+
+
+_PARAMETERS = (
+    ("describe_parameters", "rcl_interfaces/srv/DescribeParameters", "type, range and meaning of parameters"),
+    ("get_parameter_types", "rcl_interfaces/srv/GetParameterTypes", "their types"),
+    ("get_parameters", "rcl_interfaces/srv/GetParameters", "their values"),
+    ("list_parameters", "rcl_interfaces/srv/ListParameters", "their names"),
+    ("set_parameters", "rcl_interfaces/srv/SetParameters", "change some, each for itself"),
+    ("set_parameters_atomically", "rcl_interfaces/srv/SetParametersAtomically", "change all or none"),
+)
+_LIFECYCLE = (
+    ("change_state", "lifecycle_msgs/srv/ChangeState", "configure, activate, deactivate, cleanup, shutdown"),
+    ("get_available_states", "lifecycle_msgs/srv/GetAvailableStates", "states of the lifecycle"),
+    ("get_available_transitions", "lifecycle_msgs/srv/GetAvailableTransitions", "transitions from here"),
+    ("get_state", "lifecycle_msgs/srv/GetState", "present state"),
+    ("get_transition_graph", "lifecycle_msgs/srv/GetAvailableTransitions", "all transitions"),
+)
+_RECORDER = (
+    ("start", "std_srvs/srv/Trigger", "begin a bag"),
+    ("stop", "std_srvs/srv/Trigger", "end it"),
+    ("split", "std_srvs/srv/Trigger", "begin a new file"),
+    ("snapshot", "std_srvs/srv/Trigger", "write what is kept in memory"),
+)
+SERVICES = (
+    *(Service("power_manager", *entry) for entry in (*_LIFECYCLE, *_PARAMETERS)),
+    *(Service("recorder", *entry) for entry in (*_RECORDER, *_PARAMETERS)),
+    *(Service("simulator", *entry) for entry in _PARAMETERS),
+)

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.files import check_choice, check_keys, check_number, dotted, read_yaml
 from iwm_power_manager.share import share_path
+from iwm_power_manager.signals.commands import Sink, read_commands, signs, standard, wheel_names
 
 DEFAULT_MAPPING = "config/signals/standard.yaml"
 
@@ -117,10 +118,12 @@ class SignalMapping(NamedTuple):
     ----------
     path : the file
     sources : by signal; `wheel_speed` has one source for all wheels or four, each other signal one
+    commands : by command; one sink for all wheels, four, or none
     """
 
     path: Path
     sources: dict[str, tuple[Source, ...]]
+    commands: dict[str, tuple[Sink, ...]]
 
     def topics(self) -> list[str]:
         """Topics as the file names them, each once."""
@@ -129,7 +132,32 @@ class SignalMapping(NamedTuple):
     def with_wheel_names(self, names: tuple[str, ...]) -> SignalMapping:
         """The same with other names of the wheels, where wheels are found by name."""
         wheels = tuple(s._replace(names=names) if s.names else s for s in self.sources.get("wheel_speed", ()))
-        return self._replace(sources=self.sources | ({"wheel_speed": wheels} if wheels else {}))
+        commands = {
+            kind: tuple(sink._replace(names=names) if sink.names else sink for sink in sinks)
+            for kind, sinks in self.commands.items()
+        }
+        return self._replace(sources=self.sources | ({"wheel_speed": wheels} if wheels else {}), commands=commands)
+
+    def check_live(self) -> None:
+        """Refuse what the node could not drive with.
+
+        Raises
+        ------
+        ConfigError
+            A signal it needs, or a type, is missing, or the demand comes twice.
+        """
+        for signal in ("speed", "wheel_speed", "soc"):
+            if signal not in self.sources:
+                raise ConfigError(self.path, f"signals.{signal}", "is missing; the node needs it")
+        demands = [signal for signal in (*DEMANDS, *PEDALS) if signal in self.sources]
+        if demands != list(PEDALS) and (len(demands) != 1 or demands[0] in PEDALS):
+            found = ", ".join(demands) or "none"
+            allowed = f"one of {', '.join(DEMANDS)}, or both pedals"
+            raise ConfigError(self.path, "signals", f"the demand comes from {found}", allowed)
+        for sources in self.sources.values():
+            for source in sources:
+                if not source.type:
+                    raise ConfigError(self.path, f"{source.key}.type", "is missing; a live signal needs it")
 
 
 def load_mapping(path: Path | str | None = None) -> SignalMapping:
@@ -141,7 +169,7 @@ def load_mapping(path: Path | str | None = None) -> SignalMapping:
         The file is unreadable, or a key, topic, field or unit is wrong.
     """
     file = Path(path) if path is not None else share_path(DEFAULT_MAPPING)
-    content = check_keys(file, read_yaml(file), ["signals"])
+    content = check_keys(file, read_yaml(file), ["signals"], ["commands"])
     signals = check_keys(file, content["signals"], [], SIGNALS, "signals")
     sources: dict[str, tuple[Source, ...]] = {}
     for signal, entry in signals.items():
@@ -152,7 +180,8 @@ def load_mapping(path: Path | str | None = None) -> SignalMapping:
             sources[signal] = tuple(_source(file, f"{key}[{i}]", signal, item) for i, item in enumerate(entry))
         else:
             sources[signal] = (_source(file, key, signal, entry, wheels=signal == "wheel_speed"),)
-    return SignalMapping(file, sources)
+    commands = read_commands(file, content["commands"]) if "commands" in content else standard()
+    return SignalMapping(file, sources, commands)
 
 
 def _source(file: Path, key: str, signal: str, entry: Any, *, wheels: bool = False) -> Source:
@@ -163,7 +192,7 @@ def _source(file: Path, key: str, signal: str, entry: Any, *, wheels: bool = Fal
             raise ConfigError(file, dotted(key, name), f"{values[name]!r} is no name")
     units = UNITS[signal]
     unit = check_choice(file, dotted(key, "unit"), values["unit"], units)
-    sign = _signs(file, dotted(key, "sign"), values.get("sign", 1), wheels=wheels)
+    sign = signs(file, dotted(key, "sign"), values.get("sign", 1), wheels=wheels)
     factor = check_number(file, dotted(key, "factor"), values.get("factor", 1.0))
     return Source(
         key=key,
@@ -174,25 +203,10 @@ def _source(file: Path, key: str, signal: str, entry: Any, *, wheels: bool = Fal
         factor=factor * sign[0] if len(set(sign)) == 1 else factor,
         offset=check_number(file, dotted(key, "offset"), values.get("offset", 0.0)),
         signs=sign if len(set(sign)) > 1 else (),
-        names=check_names(file, dotted(key, "names"), values["names"]) if "names" in values else (),
+        names=wheel_names(file, dotted(key, "names"), values["names"]) if "names" in values else (),
         qos=check_choice(file, dotted(key, "qos"), values.get("qos", "best_effort"), RELIABILITIES),
         stamp=check_choice(file, dotted(key, "stamp"), values.get("stamp", "header"), STAMPS),
     )
-
-
-def check_names(file: Path, key: str, names: Any) -> tuple[str, ...]:
-    """Four different names of wheels; `ConfigError` for anything else."""
-    texts = isinstance(names, list) and all(isinstance(name, str) and name for name in names)
-    if texts and len(names) == len(set(names)) == WHEELS:
-        return tuple(names)
-    raise ConfigError(file, key, f"{names!r} is not allowed", "four different names: fl, fr, rl, rr")
-
-
-def _signs(file: Path, key: str, sign: Any, *, wheels: bool) -> tuple[float, ...]:
-    signs = sign if wheels and isinstance(sign, list) and len(sign) == WHEELS else [sign]
-    if any(isinstance(one, bool) or one not in (1, -1) for one in signs):
-        raise ConfigError(file, key, f"{sign!r} is not allowed", "1, -1" + (", or four of them" if wheels else ""))
-    return tuple(float(one) for one in signs)
 
 
 def topic_named(name: str, topics: Iterable[str]) -> str | None:

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.model import pedals
 from iwm_power_manager.model.parameters import VehicleParams
-from iwm_power_manager.signals.cdr import MessageReader, MessageWriter, UnreadableError, blank, field_kind
+from iwm_power_manager.model.pedals import ACCELERATION, FORCE, PEDAL_TRAVEL, TORQUE, demand_power_w
+from iwm_power_manager.signals.cdr import MessageReader, MessageWriter, UnreadableError, blank, field_kind, names_path
 from iwm_power_manager.signals.mapping import (
     BATTERY,
     DEMANDS,
@@ -35,6 +35,8 @@ _NAN = math.nan
 _NEVER_NS = -(1 << 62)
 #: A wheel of its own topic that has not come while another came so often is missing.
 _MISSED_SETS = 3
+#: What a demand that is no power is to `demand_power_w`.
+KINDS = {"force_demand": FORCE, "torque_demand": TORQUE, "acceleration_demand": ACCELERATION}
 _ARTICLES = {
     "number": "a number",
     "array": "an array",
@@ -112,20 +114,23 @@ class Assembly:
         """A demand in its own unit as power at the present speed, W."""
         if signal == "power_demand":
             return value
-        vehicle, speed = self.vehicle, max(self._speed_mps(), 0.0)
-        assert vehicle is not None  # checked when the readers were made
-        if signal == "force_demand":
-            return pedals.force_power_w(value, speed, vehicle)
-        if signal == "torque_demand":
-            return pedals.torque_power_w(value, speed, vehicle)
-        if signal == "acceleration_demand":
-            return pedals.acceleration_power_w(value, speed, vehicle)
+        assert self.vehicle is not None  # checked when the readers were made
+        speed = max(self._speed_mps(), 0.0)
+        if signal in DEMANDS:
+            return float(demand_power_w(KINDS[signal], value, 0.0, speed, self.vehicle))
         # A pedal that says nothing is not pressed less far than it goes; NaN stays NaN and is refused.
         self._pedals[signal] = value if math.isnan(value) else min(max(value, 0.0), 1.0)
         accelerator, brake = self._pedals.values()
-        if brake > 0.0:  # a brake demand gets through whatever the accelerator says
-            return float(pedals.pedal_power_w(0.0, brake, speed, vehicle))
-        return _NAN if math.isnan(brake) else float(pedals.pedal_power_w(accelerator, brake, speed, vehicle))
+        if math.isnan(brake):
+            return _NAN
+        # A brake demand gets through whatever the accelerator says.
+        return float(demand_power_w(PEDAL_TRAVEL, 0.0 if brake > 0.0 else accelerator, brake, speed, self.vehicle))
+
+    def warm(self, signals: Iterable[str]) -> None:
+        """Compile what the conversion of these signals needs, or read it from the cache."""
+        for signal in signals:
+            if signal in DEMANDS or signal in PEDALS:
+                self.demand_w(signal, 0.0)
 
     def wheel(self, wheel: int, time_ns: int, speed_radps: float) -> tuple[Reading, ...]:
         """One wheel's speed; a reading once all four have come, or one of them has stayed away for long."""
@@ -201,7 +206,7 @@ def _topic_reader(file: Path, types: Types, found: list[tuple[str, int, Source]]
         _check_source(file, types, source, all_wheels=signal == "wheel_speed" and wheel < 0)
         _check_vehicle(file, signal, source, assembly.vehicle)
         place = fields.setdefault(source.field, len(fields))
-        names = names or (_names_path(source.field) if source.names else "")
+        names = names or (names_path(source.field) if source.names else "")
         stamped = stamped and source.stamp == "header"
         if signal not in BATTERY:
             binds.append(_bind(signal, wheel, source, place, assembly))
@@ -222,10 +227,6 @@ def _together(binds: list[_Bind]) -> _Bind:
     return all_of_them
 
 
-def _names_path(field: str) -> str:
-    return ".".join([*field.split(".")[:-1], "name"])
-
-
 def _check_source(file: Path, types: Types, source: Source, *, all_wheels: bool) -> None:
     msgtype = types.name
     if source.type and source.type != msgtype:
@@ -235,7 +236,7 @@ def _check_source(file: Path, types: Types, source: Source, *, all_wheels: bool)
     if kind != wanted:
         problem = f"{source.field} is {_ARTICLES[kind]}" if kind else f"{msgtype} has no field {source.field}"
         raise ConfigError(file, f"{source.key}.field", problem, f"a field of {msgtype} that is {_ARTICLES[wanted]}")
-    if source.names and field_kind(types, _names_path(source.field)) != "texts":
+    if source.names and field_kind(types, names_path(source.field)) != "texts":
         raise ConfigError(file, f"{source.key}.names", f"{msgtype} has no field `name` beside {source.field}")
 
 

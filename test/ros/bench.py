@@ -287,6 +287,6 @@ class Bench:
         """The newest diagnostic status of that name."""
         for array in reversed(self.diagnostics):
             for status in array.status:
-                if status.name == f"power_manager: {name}":
+                if status.name == f"{self.node.get_namespace().rstrip('/')}/power_manager: {name}":
                     return status
         return None

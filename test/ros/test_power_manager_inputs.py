@@ -153,10 +153,11 @@ def test_the_state_carries_every_documented_signal(bench) -> None:
 class TestDiagnostics:
     def test_a_healthy_node_is_ok_everywhere(self, bench) -> None:
         bench.drive(lambda: len(bench.diagnostics) >= 2, "reports")
-        names = {status.name for status in bench.diagnostics[-1].status}
-        assert names == {
-            f"power_manager: {name}" for name in ("control", "inputs", "control loop", "policy", "command topics")
+        full_name = f"{bench.node.get_namespace()}/power_manager"
+        assert {status.name for status in bench.diagnostics[-1].status} == {
+            f"{full_name}: {name}" for name in ("control", "inputs", "control loop", "policy", "command topics")
         }
+        assert {status.hardware_id for status in bench.diagnostics[-1].status} == {full_name}
         for name in ("control", "inputs", "policy", "command topics"):
             bench.drive(lambda name=name: bench.status(name).level == DiagnosticStatus.OK, f"{name} to be ok")
 

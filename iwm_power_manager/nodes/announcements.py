@@ -1,0 +1,147 @@
+"""What the power manager says in its log: a line for each step on its way, and one for each change of its mode."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from iwm_power_manager.control.controller import Controller
+from iwm_power_manager.control.inputs import Violation
+from iwm_power_manager.control.monitor import BATTERY, DEMAND, FRICTION, SPEED, WHEELS
+from iwm_power_manager.control.supervision import MODE_DEGRADED, MODE_NORMAL, MODE_WAITING, STALE_NAMES
+from iwm_power_manager.nodes.preparation import COMPILING_S, Prepared
+from iwm_power_manager.signals import mapping
+
+#: What the node waits for is said again after this time.
+REPEAT_S = 5.0
+
+#: Which of the controller's inputs a signal is.
+_INPUTS = (
+    {"speed": SPEED, "wheel_speed": WHEELS, "friction": FRICTION}
+    | dict.fromkeys((*mapping.DEMANDS, *mapping.PEDALS), DEMAND)
+    | dict.fromkeys(mapping.BATTERY, BATTERY)
+)
+
+
+def input_topics(signals: mapping.SignalMapping) -> dict[str, tuple[str, ...]]:
+    """Topics of each of the controller's inputs."""
+    found: dict[str, dict[str, None]] = {}
+    for signal, sources in signals.sources.items():
+        if signal in _INPUTS:
+            found.setdefault(_INPUTS[signal], {}).update(dict.fromkeys(source.topic for source in sources))
+    return {name: tuple(topics) for name, topics in found.items()}
+
+
+class Announcements:
+    """Speaks on a node's logger, each thing once.
+
+    Parameters
+    ----------
+    logger : of the node
+    """
+
+    def __init__(self, logger: Any) -> None:
+        self._logger = logger
+        self._said: dict[str, float] = {}
+        self._problems: set[str] = set()
+        self.activated()
+
+    def activated(self) -> None:
+        """Forget the modes of before."""
+        self._mode = MODE_WAITING
+        self._stale = 0
+        self._was_degraded = False
+        self._torque_seen = False
+        self._said.clear()
+        self._said["waiting"] = time.monotonic() - REPEAT_S + 1.0  # inputs get a second to come before
+
+    def preparing(self, elapsed_s: float) -> None:
+        """Tell that it takes long, again and again."""
+        if elapsed_s > COMPILING_S and self._due("compiling"):
+            self._logger.info(
+                f"compiling the control law: {elapsed_s:.0f} s so far; the next start finds it in the cache"
+            )
+
+    def prepared(self, prepared: Prepared) -> None:
+        """Tell what was loaded."""
+        vehicle, policies = prepared.vehicle, prepared.policies
+        if prepared.elapsed_s > COMPILING_S:
+            self._logger.info(f"compiled in {prepared.elapsed_s:.1f} s")
+        self._logger.info(f"vehicle {vehicle.name} ({vehicle.hash[:12]}); {policies.description()}")
+        if policies.fallback_reason:
+            self._logger.warning(
+                f"runs equal split instead of {prepared.values['strategy']}: {policies.fallback_reason}"
+            )
+        for kind, sinks in prepared.mapping.commands.items():
+            if not sinks:
+                self._logger.warning(
+                    f"{kind} goes nowhere ({prepared.mapping.path}): the motors regenerate, another system has to brake"
+                )
+
+    def interface(self, topics: Mapping[str, tuple[str, ...]], commands: list[str], rate: str) -> None:
+        """Tell the topics the node listens to and commands on."""
+        inputs = "; ".join(f"{name} from {', '.join(found)}" for name, found in topics.items())
+        self._logger.info(f"configured, {rate}: {inputs}; commands to {', '.join(commands)}")
+
+    def problems(self, found: list[str]) -> None:
+        """Tell each endpoint that does not fit, once as long as it is there."""
+        for line in found:
+            if line not in self._problems:
+                self._logger.warning(line)
+        self._problems = set(found)
+
+    def stepped(
+        self, controller: Controller, topics: Mapping[str, tuple[str, ...]], trouble: Mapping[str, str]
+    ) -> None:
+        """Tell what has changed since the last call, while active.
+
+        Parameters
+        ----------
+        controller : with its monitor
+        topics : of each input
+        trouble : why a topic is not heard, by topic
+        """
+        mode, stale = controller.supervision.mode, controller.supervision.stale
+        if not self._torque_seen and controller.command and any(controller.command.motor_torque_nm):
+            self._torque_seen = True
+            self._logger.info(f"first torque: {sum(controller.command.motor_torque_nm):.1f} N m over all wheels")
+        if mode == MODE_WAITING and self._due("waiting"):
+            waits = self._missing(controller, topics, trouble, ~0)
+            if waits:
+                self._logger.info(f"waits for {waits}")
+        if (mode == MODE_DEGRADED and mode != self._mode) or (stale & ~self._stale and mode == MODE_DEGRADED):
+            self._logger.warning(f"degraded, motor torque fades: {self._missing(controller, topics, trouble, stale)}")
+        elif mode == MODE_NORMAL and mode != self._mode:
+            self._logger.info(f"{'recovered' if self._was_degraded else 'all inputs are there'}: normal operation")
+        self._was_degraded |= mode == MODE_DEGRADED
+        self._mode, self._stale = mode, stale
+
+    def _missing(
+        self,
+        controller: Controller,
+        topics: Mapping[str, tuple[str, ...]],
+        trouble: Mapping[str, str],
+        stale: int,
+    ) -> str:
+        parts = []
+        for bit, name in STALE_NAMES.items():
+            tally = controller.monitor.tallies[name]
+            if not stale & bit or (stale == ~0 and tally.accepted_ns is not None):
+                continue
+            found = topics.get(name, ())
+            reason = "; ".join(trouble[topic] for topic in found if topic in trouble)
+            if not reason and tally.violation is not Violation.NONE:
+                reason = (
+                    f"{sum(tally.dropped.values())} messages refused, {tally.violation.name.lower().replace('_', ' ')}"
+                )
+            where = ", ".join(topic for topic in found if topic != name)
+            parts.append(f"{name}" + (f" on {where}" if where else "") + (f" ({reason})" if reason else ""))
+        return ", ".join(parts)
+
+    def _due(self, what: str) -> bool:
+        now = time.monotonic()
+        if now - self._said.get(what, -REPEAT_S) < REPEAT_S:
+            return False
+        self._said[what] = now
+        return True

@@ -1,0 +1,168 @@
+"""What the power manager needs before it can drive: car, policies, controller, signals. In a thread of its own.
+
+Loading takes a moment, compiling the law much longer where the cache is empty. Meanwhile the node answers its services
+and says what it does.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from iwm_power_manager.control.controller import Controller, ControllerLimits
+from iwm_power_manager.control.thresholds import input_limits, supervision_limits
+from iwm_power_manager.errors import BagError, ConfigError, IwmError
+from iwm_power_manager.nodes import power_manager_config as config
+from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
+from iwm_power_manager.ros import messages
+from iwm_power_manager.share import resolve
+from iwm_power_manager.signals.commands import CommandWriter
+from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, SignalMapping, load_mapping
+from iwm_power_manager.signals.readings import Assembly, TopicReader, topic_readers
+from iwm_power_manager.signals.types import types_of
+from iwm_power_manager.vehicle import Vehicle, load_vehicle
+
+#: Preparing takes longer than this only where the law has to be compiled.
+COMPILING_S = 3.0
+
+
+class Prepared(NamedTuple):
+    """Everything `prepare` makes.
+
+    Attributes
+    ----------
+    values : the parameters it was made from
+    vehicle, policies, controller : as loaded; the law is warm
+    mapping : the signals file
+    readers : by topic
+    commands : writer of each command
+    elapsed_s : time it took
+    """
+
+    values: Mapping[str, Any]
+    vehicle: Vehicle
+    policies: Policies
+    controller: Controller
+    mapping: SignalMapping
+    readers: dict[str, TopicReader]
+    commands: dict[str, CommandWriter]
+    elapsed_s: float
+
+
+def prepare(values: Mapping[str, Any]) -> Prepared:
+    """Load and verify everything the parameters name, and warm the compiled law.
+
+    Raises
+    ------
+    IwmError
+        A file is missing or wrong, or a policy is of another car.
+    """
+    started_s = time.monotonic()
+    vehicle = load_vehicle(resolve(values["vehicle_file"]), values["idle_drive"] or None)
+    policies = choose_policies(values["policy_file"], values["strategy"], values["fallback"], values["rule"], vehicle)
+    thresholds = config.thresholds_of(values)
+    limits = ControllerLimits(
+        input_limits(thresholds, vehicle.params.front.wheel.radius_m, by_clock=not values["lockstep"]),
+        None if values["lockstep"] else config.age_limits_s(values),
+        supervision_limits(thresholds),
+    )
+    names = tuple(values["wheel_names"])
+    table = policies.table(values["friction"])
+    controller = Controller(
+        vehicle.params, names, limits, config.law_settings(values, policies.strategy), table, values["friction"]
+    )
+    mapping = load_mapping(resolve(values["signals_file"]))
+    if values["signals_file"] == DEFAULT_MAPPING:
+        mapping = mapping.with_wheel_names(names)
+    readers, commands = _interface(mapping, controller, vehicle, names)
+    # The first call compiles the law or reads it from the cache: seconds that no control step may take.
+    for warmed in policies.tables():
+        controller.policy = warmed
+        controller.step(0, 1.0 / values["rate_hz"])
+    controller.policy = table
+    controller.reset()
+    elapsed_s = time.monotonic() - started_s
+    return Prepared(values, vehicle, policies, controller, mapping, readers, commands, elapsed_s)
+
+
+def _interface(
+    mapping: SignalMapping, controller: Controller, vehicle: Vehicle, names: tuple[str, ...]
+) -> tuple[dict[str, TopicReader], dict[str, CommandWriter]]:
+    mapping.check_live()
+    monitor = controller.monitor
+    assembly = Assembly(names, vehicle.params, lambda: monitor.speed_mps)
+    assembly.warm(mapping.sources)
+    types = {}
+    for source in (source for sources in mapping.sources.values() for source in sources):
+        _check_installed(mapping.path, source.key, source.type)
+        types[source.topic] = types_of(source.type)
+    for sink in (sink for sinks in mapping.commands.values() for sink in sinks):
+        _check_installed(mapping.path, sink.key, sink.type)
+    commands = {kind: CommandWriter(mapping.path, sinks) for kind, sinks in mapping.commands.items()}
+    return topic_readers(mapping, types, assembly), commands
+
+
+def _check_installed(file: Path, key: str, msgtype: str) -> None:
+    """DDS needs a type's support library, its definition needs the `.msg`: both come with the package."""
+    try:
+        messages.message_class(msgtype)
+        types_of(msgtype)
+    except (ImportError, BagError, ValueError):
+        problem = f"{msgtype} is not installed here"
+        raise ConfigError(
+            file, f"{key}.type", problem, "a type of a sourced workspace, such as std_msgs/msg/Float64"
+        ) from None
+
+
+class Preparation:
+    """`prepare` in a thread.
+
+    Parameters
+    ----------
+    values : of the parameters
+    done : called in that thread when it has ended
+
+    Attributes
+    ----------
+    values : as given
+    """
+
+    def __init__(self, values: Mapping[str, Any], done: Callable[[], None]) -> None:
+        self.values = values
+        self._started_s = time.monotonic()
+        self._prepared: Prepared | None = None
+        self._error: IwmError | None = None
+        self._done = done
+        self._thread = threading.Thread(target=self._run, name="preparation", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._prepared = prepare(self.values)
+        except IwmError as error:
+            self._error = error
+        except Exception as error:  # noqa: BLE001 - whatever stood behind it, the node says so and stays unconfigured
+            self._error = IwmError(f"{type(error).__name__}: {' '.join(str(error).split())}")
+        finally:
+            self._done()
+
+    @property
+    def running(self) -> bool:
+        """It has not ended."""
+        return self._thread.is_alive()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since it began."""
+        return time.monotonic() - self._started_s
+
+    def result(self) -> Prepared:
+        """Wait for the end; what was prepared, or the `IwmError` that stood against it."""
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        assert self._prepared is not None
+        return self._prepared

@@ -1,0 +1,66 @@
+"""Endpoints of others that a node cannot be connected with: another type, or a quality of service that does not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, qos_check_compatible
+
+
+def mismatched_publishers(node: Node, subscriptions: Iterable[Any], msgtypes: dict[str, str]) -> dict[str, str]:
+    """Why publishers of these subscriptions' topics are not heard, by topic name of the subscription.
+
+    Parameters
+    ----------
+    node : whose subscriptions they are
+    subscriptions : of rclpy
+    msgtypes : type of each, by topic name
+    """
+    found = {}
+    for subscription in subscriptions:
+        topic = subscription.topic_name
+        if subscription.get_publisher_count() >= node.count_publishers(topic):
+            continue
+        lines = []
+        for info in node.get_publishers_info_by_topic(topic):
+            if info.topic_type != msgtypes[topic]:
+                lines.append(f"{_name(info)} sends {info.topic_type}, not {msgtypes[topic]}")
+                continue
+            fits, reason = qos_check_compatible(info.qos_profile, subscription.qos_profile)
+            if fits == QoSCompatibility.ERROR:
+                lines.append(f"{_name(info)} offers another quality of service: {_short(reason)}")
+        if lines:
+            found[topic] = "; ".join(lines)
+    return found
+
+
+def mismatched_subscribers(node: Node, publishers: Iterable[Any], msgtypes: dict[str, str]) -> dict[str, str]:
+    """Why subscribers of these publishers' topics do not hear them, by topic name of the publisher."""
+    found = {}
+    for publisher in publishers:
+        topic = publisher.topic_name
+        if publisher.get_subscription_count() >= node.count_subscribers(topic):
+            continue
+        lines = []
+        for info in node.get_subscriptions_info_by_topic(topic):
+            if info.topic_type != msgtypes[topic]:
+                lines.append(f"{_name(info)} wants {info.topic_type}, not {msgtypes[topic]}")
+                continue
+            fits, reason = qos_check_compatible(publisher.qos_profile, info.qos_profile)
+            if fits == QoSCompatibility.ERROR:
+                lines.append(f"{_name(info)} asks for another quality of service: {_short(reason)}")
+        if lines:
+            found[topic] = "; ".join(lines)
+    return found
+
+
+def _name(info: Any) -> str:
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+
+
+def _short(reason: str) -> str:
+    """The policies that do not fit, of a text such as "ERROR: Best effort publisher and reliable subscription;"."""
+    parts = [part.removeprefix("ERROR:").strip() for part in reason.split(";")]
+    return ", ".join(part.lower() for part in parts if part and not part.startswith("WARNING"))

@@ -1,0 +1,223 @@
+"""Cars of other stacks, connected by YAML alone: what they send, what they obey, over DDS between processes."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from bench import Running, arguments
+from stack import JOINTS, NUMBER, NUMBERS, Stack, number, of_type
+
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+
+MODULE = "iwm_power_manager.nodes.power_manager"
+DOMAIN = int(os.environ["ROS_DOMAIN_ID"])
+CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+RADIUS_M = CAR.front.wheel.radius_m
+ODOMETRY, TWIST, ACCEL = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist", "geometry_msgs/msg/AccelStamped"
+BATTERY = "sensor_msgs/msg/BatteryState"
+COMMANDS = {"wheel_torque_command": JOINTS, "friction_brake_command": JOINTS}
+
+
+class Connected:
+    """A power manager told by a signals file of the stack beside it."""
+
+    def __init__(self, folder: Path, name: str, text: str | Path, stack: Stack, parameters: dict[str, Any]) -> None:
+        path = text if isinstance(text, Path) else folder / "signals.yaml"
+        if isinstance(text, str):
+            path.write_text(text)
+        given = {"strategy": "equal", "policy_file": "", "signals_file": path, **parameters}
+        remaps = {"__ns": name, "/diagnostics": f"{name}/diagnostics"}
+        remaps |= {topic: name + topic for topic in ("/odom", "/joint_states", "/pedals/accelerator", "/pedals/brake")}
+        remaps |= {topic: name + topic for topic in ("/battery/charge", "/battery/temperature")}
+        self.stack = stack
+        self.running = Running(MODULE, arguments(given, remaps), DOMAIN, folder)
+
+
+@pytest.fixture
+def connect(tmp_path: Path, compiled_law: None, request: pytest.FixtureRequest) -> Iterator[Callable[..., Connected]]:
+    made: list[Connected] = []
+
+    def start(
+        text: str | Path,
+        sends: dict[str, str],
+        hears: dict[str, str] | None = None,
+        reliability: str = "best_effort",
+        **parameters: Any,
+    ) -> Connected:
+        name = f"/stack_{os.getpid()}_{abs(hash(request.node.name)) % 10**6}_{len(made)}"
+        stack = Stack(DOMAIN, name, sends, COMMANDS if hears is None else hears, reliability)
+        made.append(Connected(tmp_path, name, text, stack, parameters))
+        return made[-1]
+
+    yield start
+    for one in made:
+        one.running.process.kill()
+        one.running.process.wait()
+        one.stack.close()
+
+
+def torque_nm(message: Any) -> float:
+    return sum(message.effort) if message is not None else 0.0
+
+
+def test_a_car_with_odometry_pedals_and_foreign_joints_drives_and_brakes(connect: Callable[..., Connected]) -> None:
+    """The shipped file as it is; every absolute topic of it remapped, as a launch file would."""
+    sends = {
+        "odom": ODOMETRY,
+        "joint_states": JOINTS,
+        "pedals/accelerator": NUMBER,
+        "pedals/brake": NUMBER,
+        "battery/charge": "std_msgs/msg/Float32",
+        "battery/temperature": "std_msgs/msg/Float32",
+    }
+    car = connect(share_path("config/signals/odometry_and_pedals.yaml"), sends)
+    brake = 0.0
+
+    def inputs(stack: Stack) -> dict[str, Any]:
+        names = ["wheel_rr_joint", "wheel_fl_joint", "steering", "wheel_rl_joint", "wheel_fr_joint"]
+        rpm = 10.0 / RADIUS_M * 30.0 / math.pi
+        return {
+            "odom": of_type(ODOMETRY, header__stamp=stack.stamp(), twist__twist__linear__x=10.0),
+            "joint_states": of_type(
+                JOINTS, header__stamp=stack.stamp(), name=names, velocity=[rpm, rpm, 0.0, rpm, rpm]
+            ),
+            "pedals/accelerator": number(30.0),
+            "pedals/brake": number(brake),
+            "battery/charge": of_type("std_msgs/msg/Float32", data=80.0),
+            "battery/temperature": of_type("std_msgs/msg/Float32", data=25.0),
+        }
+
+    last = car.stack.last
+    car.stack.drive(inputs, lambda: torque_nm(last("wheel_torque_command")) > 100.0, "driving torque")
+    brake = 50.0
+    car.stack.drive(inputs, lambda: torque_nm(last("friction_brake_command")) < -100.0, "braking torque")
+    assert torque_nm(last("wheel_torque_command")) < 0.0
+
+
+FOUR_TOPICS = """
+signals:
+  speed: {topic: speed_kmh, type: geometry_msgs/msg/Twist, field: linear.x, unit: km/h}
+  wheel_speed:
+    - {topic: rpm_0, type: std_msgs/msg/Float64, field: data, unit: rpm}
+    - {topic: rpm_1, type: std_msgs/msg/Float64, field: data, unit: rpm, sign: -1}
+    - {topic: rpm_2, type: std_msgs/msg/Float64, field: data, unit: rpm}
+    - {topic: rpm_3, type: std_msgs/msg/Float64, field: data, unit: rpm, sign: -1}
+  acceleration_demand: {topic: wanted, type: geometry_msgs/msg/AccelStamped, field: accel.linear.x, unit: m/s2}
+  soc: {topic: charge, type: std_msgs/msg/Float64, field: data, unit: "%"}
+commands:
+  motor_torque:
+    - {topic: torque_0, type: std_msgs/msg/Float64, field: data, unit: N m}
+    - {topic: torque_1, type: std_msgs/msg/Float64, field: data, unit: N m, sign: -1}
+    - {topic: torque_2, type: std_msgs/msg/Float64, field: data, unit: N m}
+    - {topic: torque_3, type: std_msgs/msg/Float64, field: data, unit: N m, sign: -1}
+  friction_torque: none
+"""
+
+
+def test_a_car_with_four_rpm_topics_and_an_acceleration_demand_starts_from_rest(
+    connect: Callable[..., Connected],
+) -> None:
+    """At 50 Hz, best effort, unstamped: the periods are parameters, the time is DDS's."""
+    sends = {"speed_kmh": TWIST, "wanted": ACCEL, "charge": NUMBER} | {f"rpm_{i}": NUMBER for i in range(4)}
+    hears = {f"torque_{i}": NUMBER for i in range(4)}
+    periods = {f"input_period_s.{name}": 0.02 for name in ("vehicle_speed", "wheel_states", "power_demand")}
+    car = connect(FOUR_TOPICS, sends, hears, **periods)
+
+    def inputs(stack: Stack) -> dict[str, Any]:
+        wheels = {f"rpm_{i}": number(0.0) for i in range(4)}
+        wanted = of_type(ACCEL, header__stamp=stack.stamp(), accel__linear__x=1.0)
+        return {"speed_kmh": of_type(TWIST), "wanted": wanted, "charge": number(80.0), **wheels}
+
+    def torques() -> list[float]:
+        found = [car.stack.last(f"torque_{i}") for i in range(4)]
+        return [message.data for message in found] if all(found) else [0.0] * 4
+
+    mass_kg = CAR.chassis.mass_kg + 4.0 * CAR.front.wheel.inertia_kgm2 / RADIUS_M**2
+    each = mass_kg * 1.0 * RADIUS_M / 4.0
+    wanted = [each, -each, each, -each]
+    car.stack.drive(inputs, lambda: torques() == pytest.approx(wanted, rel=0.02), "the torque of 1 m/s2", 0.02)
+    assert "friction_torque goes nowhere" in car.running.text()
+
+
+ROS2_CONTROL = Path(__file__).resolve().parents[2] / "examples" / "ros2_control" / "signals.yaml"
+
+
+@pytest.mark.parametrize(("reliability", "rate_hz"), [("best_effort", 50), ("reliable", 1000)])
+def test_ros2_control_is_commanded_in_the_order_of_its_joints(
+    connect: Callable[..., Connected], reliability: str, rate_hz: int
+) -> None:
+    """joint_state_broadcaster and forward_command_controller, played by a stand-in at the rate of its controllers."""
+    sends = {
+        "joint_states": JOINTS,
+        "cmd_force": NUMBER,
+        "odom": ODOMETRY,
+        "battery_state": "sensor_msgs/msg/BatteryState",
+    }
+    hears = {"wheel_effort_controller/commands": NUMBERS, "brake_effort_controller/commands": NUMBERS}
+    names = ("vehicle_speed", "wheel_states", "power_demand", "battery_state")
+    periods = {f"input_period_s.{name}": max(1.0 / rate_hz, 0.01) for name in names}
+    split = {"strategy": "rule", "rule": [0.0, 0.75, 0.0, 0.5]}
+    car = connect(ROS2_CONTROL, sends, hears, reliability, **split, **periods)
+    wheels = ("rear_left", "rear_right", "front_left", "front_right")
+
+    def inputs(stack: Stack) -> dict[str, Any]:
+        joints = [f"{wheel}_wheel_joint" for wheel in wheels]
+        stamp = stack.stamp()
+        return {
+            "joint_states": of_type(JOINTS, header__stamp=stamp, name=joints, velocity=[10.0 / RADIUS_M] * 4),
+            "odom": of_type(ODOMETRY, header__stamp=stamp, twist__twist__linear__x=10.0),
+            "battery_state": of_type(
+                "sensor_msgs/msg/BatteryState", header__stamp=stamp, percentage=0.5, temperature=25.0
+            ),
+            "cmd_force": number(400.0),
+        }
+
+    def commanded() -> list[float]:
+        message = car.stack.last("wheel_effort_controller/commands")
+        return list(message.data) if message else [0.0] * 4
+
+    rear, front = (400.0 * RADIUS_M * part / 2.0 for part in (0.25, 0.75))
+    expected = pytest.approx([rear, rear, front, front], rel=0.02)
+    car.stack.drive(inputs, lambda: commanded() == expected, "400 N", 1.0 / rate_hz)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"linear.x": "linear.q"}, "signals.speed.field: geometry_msgs/msg/Twist has no field linear.q"),
+        ({"unit: km/h": "unit: knots"}, "signals.speed.unit: 'knots' is unknown; allowed: m/s"),
+        (
+            {"geometry_msgs/msg/Twist,": "my_msgs/msg/Speed,"},
+            "signals.speed.type: my_msgs/msg/Speed is not installed here",
+        ),
+        ({"  soc:": "  sox:"}, "signals: unknown key 'sox'"),
+        ({"friction_torque: none": "friction_torque: nothing"}, "commands.friction_torque"),
+        ({"torque_3, type: std_msgs/msg/Float64": "torque_3, type: std_msgs/msg/Int32"}, "cannot hold 1 torques"),
+        (
+            {"acceleration_demand": "accelerator_pedal", "m/s2": '"1"'},
+            "the demand comes from accelerator_pedal; allowed: one of power_demand, force_demand",
+        ),
+    ],
+)
+def test_a_mapping_that_cannot_work_is_one_line_that_names_the_key(
+    tmp_path: Path, change: dict[str, str], problem: str
+) -> None:
+    text = FOUR_TOPICS
+    for old, new in change.items():
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / "signals.yaml"
+    path.write_text(text)
+    running = Running(
+        MODULE, arguments({"strategy": "equal", "policy_file": "", "signals_file": path}), DOMAIN, tmp_path
+    )
+    assert running.wait() == 1
+    (line,) = [line for line in running.text().splitlines() if line.strip()]
+    assert f"{path}: " in line
+    assert problem in line
