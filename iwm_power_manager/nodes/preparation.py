@@ -94,7 +94,6 @@ def _interface(
     mapping.check_live()
     monitor = controller.monitor
     assembly = Assembly(names, vehicle.params, lambda: monitor.speed_mps)
-    assembly.warm(mapping.sources)
     types = {}
     for source in (source for sources in mapping.sources.values() for source in sources):
         _check_installed(mapping.path, source.key, source.type)
@@ -102,7 +101,9 @@ def _interface(
     for sink in (sink for sinks in mapping.commands.values() for sink in sinks):
         _check_installed(mapping.path, sink.key, sink.type)
     commands = {kind: CommandWriter(mapping.path, sinks) for kind, sinks in mapping.commands.items()}
-    return topic_readers(mapping, types, assembly), commands
+    readers = topic_readers(mapping, types, assembly)
+    assembly.warm(mapping.sources)
+    return readers, commands
 
 
 def _check_installed(file: Path, key: str, msgtype: str) -> None:

@@ -196,7 +196,7 @@ def test_ros2_control_is_commanded_in_the_order_of_its_joints(
             {"geometry_msgs/msg/Twist,": "my_msgs/msg/Speed,"},
             "signals.speed.type: my_msgs/msg/Speed is not installed here",
         ),
-        ({"  soc:": "  sox:"}, "signals: unknown key 'sox'"),
+        ({"  soc:": "  sox:"}, "signals.sox: is an unknown key"),
         ({"friction_torque: none": "friction_torque: nothing"}, "commands.friction_torque"),
         ({"torque_3, type: std_msgs/msg/Float64": "torque_3, type: std_msgs/msg/Int32"}, "cannot hold 1 torques"),
         (
@@ -218,6 +218,6 @@ def test_a_mapping_that_cannot_work_is_one_line_that_names_the_key(
         MODULE, arguments({"strategy": "equal", "policy_file": "", "signals_file": path}), DOMAIN, tmp_path
     )
     assert running.wait() == 1
-    (line,) = [line for line in running.text().splitlines() if line.strip()]
+    (line,) = [line for line in running.text().splitlines() if line.startswith("[ERROR]")]
     assert f"{path}: " in line
     assert problem in line
