@@ -25,6 +25,7 @@ EXECUTABLES = {
     "replay": "iwm_power_manager.executables:replay",
     "simulator": "iwm_sim.executables:simulator",
     "solve_policy": "iwm_power_manager.executables:solve_policy",
+    "watch_car": "iwm_power_manager.executables:watch_car",
 }
 
 
@@ -92,6 +93,8 @@ setup(
         # Only where no ROS 2 Jazzy is installed: the same rclpy and Fast DDS as wheels.
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
         "test": ["pytest"],
+        # The page of `watch_car`.
+        "watch": ["bokeh"],
     },
     zip_safe=False,
     entry_points={"console_scripts": [f"{name} = {target}" for name, target in EXECUTABLES.items()]},

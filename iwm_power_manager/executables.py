@@ -64,3 +64,8 @@ def replay() -> int:
 def solve_policy() -> int:
     """Command `solve_policy`."""
     return run("iwm_power_manager.tools.solve_policy", INTERRUPTED)
+
+
+def watch_car() -> int:
+    """Command `watch_car`."""
+    return run("iwm_power_manager.tools.watch_car", INTERRUPTED)

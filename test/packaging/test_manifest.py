@@ -28,6 +28,7 @@ ROS_MODULES = {
 }  # fmt: skip
 #: Other imports, and the rosdep key that brings them.
 ROSDEP_KEYS = {
+    "bokeh": "python3-bokeh-pip",
     "jinja2": "python3-jinja2",
     "apsw": "python3-rosbags-pip",
     "lz4": "python3-rosbags-pip",

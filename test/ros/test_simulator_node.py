@@ -308,11 +308,11 @@ def test_what_it_cannot_work_with_gives_one_line_and_exit_code_1(capfd, monkeypa
     assert expected in lines[0]
 
 
-def test_a_parameter_that_does_not_exist_is_warned_about(capfd, monkeypatch) -> None:
+def test_a_parameter_that_does_not_exist_is_refused(capfd, monkeypatch) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    given = arguments({"cycle": "udds", "cycle_file": "/nowhere.csv"}, {"__ns": f"/alone_{os.getpid()}"})
+    given = arguments({"cycle": "udds"}, {"__ns": f"/alone_{os.getpid()}"})
     assert simulator.main(["simulator", *given]) == 1
-    assert "parameter cycle is unknown and has no effect; is cycle_file meant?" in capfd.readouterr().err
+    assert "parameter cycle is unknown; is cycle_file meant?" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,245 @@
+"""See a running car in the browser: one page, served on this machine only, fed by the power manager's topics alone.
+
+Charts and server are Bokeh's, whose scripts come from the same server: no network is needed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+from iwm_power_manager.control.supervision import MODE_NAMES, STALE_NAMES
+from iwm_power_manager.control.types import GATE_NAMES, LIMIT_NAMES, WHEEL_NAMES
+from iwm_power_manager.errors import IwmError
+from iwm_power_manager.signals.contract import DIAGNOSTICS, POWER_MANAGER_STATE
+
+#: Steps that are kept for a page that has just been opened, and points a chart shows.
+KEPT = 3000
+POINTS = 1500
+#: One step of so many is drawn; the page takes what is new this often.
+EVERY = 5
+REFRESH_MS = 200
+LEVELS = ("ok", "warn", "error", "stale")
+_NAN = float("nan")
+_COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
+
+
+class Row(NamedTuple):
+    """One step, numbered from the first that was heard."""
+
+    number: int
+    values: dict[str, float]
+
+
+class Feed:
+    """What the topics have said last; filled by the executor's thread, read by the pages."""
+
+    def __init__(self) -> None:
+        self.rows: deque[Row] = deque(maxlen=KEPT)
+        self.names: tuple[str, ...] = ()
+        self.statuses: dict[str, tuple[str, str]] = {}
+        self._heard = 0
+        self._first_s: float | None = None
+
+    def state(self, stamp_ns: int, values: Mapping[str, float]) -> None:
+        """Take one step of the power manager."""
+        self._heard += 1
+        if self._heard % EVERY:
+            return
+        time_s = stamp_ns * 1e-9
+        if self._first_s is None:
+            self._first_s = time_s
+        self.names = tuple(values)
+        self.rows.append(Row(self._heard // EVERY, {"time_s": time_s - self._first_s, **values}))
+
+    def status(self, name: str, level: int, message: str) -> None:
+        """Take one status of `/diagnostics`."""
+        self.statuses[name] = (LEVELS[level], message)
+
+    def since(self, number: int) -> list[Row]:
+        """Steps after that one, oldest first."""
+        newer = itertools.takewhile(lambda row: row.number > number, reversed(list(self.rows)))
+        return list(newer)[::-1]
+
+
+def in_words(values: Mapping[str, float]) -> str:
+    """Mode, gate, limits and missing inputs of a step."""
+    limits = [name for bit, name in LIMIT_NAMES.items() if int(values["limits"]) & bit]
+    missing = [name for bit, name in STALE_NAMES.items() if int(values["stale"]) & bit]
+    parts = [
+        f"mode: <b>{MODE_NAMES[int(values['mode'])]}</b>",
+        f"gate: {GATE_NAMES[int(values['gate'])]}",
+        f"limits that bind: {', '.join(limits) or 'none'}",
+        f"missing: {', '.join(missing) or 'nothing'}",
+        f"speed {values['speed_mps']:.2f} m/s, demand {values['power_demand_w'] / 1e3:.2f} kW,"
+        f" front share {values['front_share']:.2f}, charge {100.0 * values['soc']:.1f} %",
+    ]
+    return " &nbsp;·&nbsp; ".join(parts)
+
+
+def charts(names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Title of each chart, and its lines: signal by label."""
+    slips = {name.removesuffix("_slip"): name for name in names if name.endswith("_slip") and "." not in name}
+    return {
+        "speed, m/s": {"car": "speed_mps"},
+        "power demand, W": {"asked": "requested_power_w", "used": "power_demand_w"},
+        "front share": {"applied": "front_share", "decided": "decided_share"},
+        "motor torque, N m": {wheel: f"{wheel}_motor_torque_nm" for wheel in WHEEL_NAMES},
+        "friction brake torque, N m": {wheel: f"{wheel}_friction_torque_nm" for wheel in WHEEL_NAMES},
+        "slip": slips,
+        "motor torque allowed, 0..1": {"factor": "motor_factor"},
+    }
+
+
+def make_page(document: Any, feed: Feed) -> None:
+    """Fill a browser's document, and keep it filled."""
+    from bokeh.layouts import column, gridplot
+    from bokeh.models.sources import ColumnDataSource
+    from bokeh.models.widgets import DataTable, Div, TableColumn
+    from bokeh.plotting import figure
+
+    lines = charts(feed.names)
+    signals = sorted({signal for drawn in lines.values() for signal in drawn.values()})
+    state = ColumnDataSource({name: [] for name in ("time_s", *signals)}, name="state")
+    words = Div(text="nothing heard yet", name="words")
+    table = ColumnDataSource({"level": [], "name": [], "message": []}, name="diagnostics")
+    figures: list[Any] = []
+    for title, drawn in lines.items():
+        shared = {"x_range": figures[0].x_range} if figures else {}
+        chart = figure(title=title, height=220, width=560, tools="pan,wheel_zoom,reset", **shared)
+        for color, (label, signal) in zip(_COLORS, drawn.items(), strict=False):
+            chart.line("time_s", signal, source=state, legend_label=label, color=color)
+        chart.legend.label_text_font_size = "8pt"
+        chart.legend.visible = len(drawn) > 1
+        figures.append(chart)
+    widths = {"level": 60, "name": 260, "message": 780}
+    columns = [TableColumn(field=field, title=field, width=width) for field, width in widths.items()]
+    statuses = DataTable(source=table, columns=columns, width=1120, height=240, index_position=None)
+    document.title = "power manager"
+    document.add_root(column(words, gridplot(figures, ncols=2, merge_tools=False), statuses))
+    seen = 0
+
+    def refresh() -> None:
+        nonlocal seen
+        rows = feed.since(seen)
+        if rows:
+            seen = rows[-1].number
+            words.text = in_words(rows[-1].values)
+            found: dict[str, Any] = {
+                name: [row.values.get(name, float("nan")) for row in rows] for name in ("time_s", *signals)
+            }
+            state.stream(found, rollover=POINTS)
+        shown = sorted(feed.statuses.items())
+        table.data = {
+            "level": [level for _, (level, _) in shown],
+            "name": [name for name, _ in shown],
+            "message": [message for _, (_, message) in shown],
+        }
+
+    document.add_periodic_callback(refresh, REFRESH_MS)
+
+
+def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread, Any]:
+    """Hear state and diagnostics in a thread: the node, the thread, and its executor."""
+    import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.node import Node
+    from rclpy.signals import SignalHandlerOptions
+    from sensor_msgs.msg import JointState
+
+    from iwm_power_manager.ros import messages, qos
+
+    rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("watch_car", enable_rosout=False, start_parameter_services=False)
+    asked = qos.profile(lockstep=False, depth=100, reliability="best_effort")
+    node.create_subscription(
+        JointState, POWER_MANAGER_STATE, lambda message: feed.state(*messages.read_named_numbers(message)), asked
+    )
+
+    def diagnosed(message: DiagnosticArray) -> None:
+        for status in message.status:
+            feed.status(status.name, status.level[0], status.message)
+
+    node.create_subscription(DiagnosticArray, DIAGNOSTICS, diagnosed, asked)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def spin() -> None:
+        with suppress(ExternalShutdownException):
+            executor.spin()
+
+    thread = threading.Thread(target=spin, name="topics", daemon=True)
+    thread.start()
+    return node, thread, executor
+
+
+def serve(feed: Feed, port: int, *, open_browser: bool) -> None:
+    """Serve pages until Ctrl-C or SIGTERM."""
+    import signal
+
+    from bokeh.application import Application
+    from bokeh.application.handlers import FunctionHandler
+    from bokeh.server.server import Server
+
+    application = Application(FunctionHandler(lambda document: make_page(document, feed)))
+    try:
+        server = Server({"/": application}, address="127.0.0.1", port=port)
+    except OSError as error:
+        raise IwmError(f"--port {port}: {error.strerror or error}") from None
+    url = f"http://localhost:{server.port}/"
+    loop = server.io_loop
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: loop.add_callback_from_signal(loop.stop))
+    server.start()
+    print(f"watch_car: {url}", flush=True)
+    if open_browser:
+        loop.add_callback(server.show, "/")
+    loop.start()
+    server.stop()
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the page; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="watch_car",
+        description="Show a running car in the browser, from the power manager's topics alone; Ctrl-C ends it.",
+        epilog="ROS arguments may follow: --ros-args -r __ns:=/car_1 -r power_manager/state:=my_node/state",
+    )
+    parser.add_argument("--port", type=int, default=8321, help="port on this machine (default 8321; 0: any)")
+    parser.add_argument("--no-browser", action="store_true", help="only serve, and print the address")
+    given = list(sys.argv[1:] if args is None else args)
+    own = given[: given.index("--ros-args")] if "--ros-args" in given else given
+    options = parser.parse_args(own)
+    try:
+        import bokeh  # noqa: F401 - named here, before anything has begun
+    except ImportError:
+        print("watch_car: needs the package bokeh (python3-bokeh-pip, or pip install bokeh)", file=sys.stderr)
+        return 1
+    from iwm_power_manager.ros import ending
+
+    feed = Feed()
+    node, thread, executor = listen(feed, ["watch_car", *given[len(own) :]])
+    code = 1
+    try:
+        serve(feed, options.port, open_browser=not options.no_browser)
+        code = 0
+    except IwmError as error:
+        print(f"watch_car: {error}", file=sys.stderr)
+    finally:
+        with ending.bounded(code):
+            executor.shutdown()
+            thread.join(1.0)
+            node.destroy_node()
+            node = executor = None
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

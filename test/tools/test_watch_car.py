@@ -1,0 +1,182 @@
+"""The page of a running car: what the topics said stands in it, in a real browser where there is one."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.tools import watch_car
+from iwm_power_manager.tools.watch_car import EVERY, Feed, charts, in_words
+
+ROOT = Path(__file__).resolve().parents[2]
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+def values(**given: float) -> dict[str, float]:
+    return dict.fromkeys(SIGNAL_NAMES, 0.0) | given
+
+
+def test_a_page_gets_each_drawn_step_once_and_in_order() -> None:
+    feed = Feed()
+    for i in range(10 * EVERY):
+        feed.state(i * 10_000_000, values(speed_mps=float(i)))
+    rows = feed.since(0)
+    assert [row.number for row in rows] == list(range(1, 11))
+    assert rows[1].values["time_s"] == pytest.approx(EVERY * 0.01)
+    assert feed.since(8) == rows[8:]
+    assert feed.since(10) == []
+
+
+def test_mode_gate_limits_and_missing_inputs_stand_in_words() -> None:
+    text = in_words(values(mode=2.0, gate=1.0, limits=66.0, stale=9.0, speed_mps=3.0, power_demand_w=1500.0, soc=0.5))
+    for part in ("<b>degraded</b>", "gate: front", "regeneration, slip", "vehicle_speed, battery_state", "1.50 kW"):
+        assert part in text
+    assert "limits that bind: none" in in_words(values())
+
+
+def test_every_line_of_the_charts_is_a_signal_of_the_state() -> None:
+    lines = charts(SIGNAL_NAMES)
+    assert {signal for found in lines.values() for signal in found.values()} <= set(SIGNAL_NAMES)
+    assert len(lines["slip"]) >= 2
+
+
+def test_a_port_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("bokeh")
+    monkeypatch.setattr(watch_car, "listen", lambda *_: (_Nothing(), _Nothing(), _Nothing()))
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        assert watch_car.main(["--no-browser", "--port", str(taken.getsockname()[1])]) == 1
+    assert "watch_car: --port" in capsys.readouterr().err
+
+
+class _Nothing:
+    def __getattr__(self, _: str) -> Any:
+        return lambda *_, **__: None
+
+
+@pytest.mark.skipif(BROWSER is None, reason="there is no browser here")
+def test_the_page_shows_a_running_car(tmp_path: Path) -> None:
+    """A stand-in speaks the topics; the page is read through the browser's own debugger."""
+    pytest.importorskip("bokeh")
+    environment = {**os.environ, "ROS_LOG_DIR": str(tmp_path), "PYTHONUNBUFFERED": "1"}
+    name = f"/watch_{os.getpid()}"
+    car = subprocess.Popen([sys.executable, "-c", _CAR, name], env=environment)
+    command = [sys.executable, "-m", "iwm_power_manager.tools.watch_car", "--no-browser", "--port", "0", "--ros-args"]
+    page = subprocess.Popen(
+        [*command, "-r", f"__ns:={name}", "-r", f"/diagnostics:={name}/diagnostics"],
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert page.stdout is not None
+        url = re.search(r"http://localhost:\d+/", page.stdout.readline())
+        assert url is not None
+        found = _read_page(url[0], tmp_path)
+        assert found["speed"] == pytest.approx(12.5)
+        assert "<b>normal</b>" in found["words"]
+        assert found["status"] == ["warn", f"{name}/power_manager: control", "a word"]
+        assert found["figures"] == len(charts(SIGNAL_NAMES))
+        assert found["foreign"] == []
+        page.send_signal(2)
+        assert page.wait(30) == 0
+    finally:
+        for process in (page, car):
+            process.kill()
+            process.wait()
+
+
+_CAR = """
+import sys, time, rclpy
+from rclpy.node import Node
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from sensor_msgs.msg import JointState
+from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.ros import messages
+rclpy.init()
+node = Node("power_manager", namespace=sys.argv[1])
+state = node.create_publisher(JointState, "~/state", 10)
+diagnostics = node.create_publisher(DiagnosticArray, sys.argv[1] + "/diagnostics", 10)
+values = dict.fromkeys(SIGNAL_NAMES, 0.0) | {"speed_mps": 12.5, "mode": 1.0}
+status = DiagnosticStatus(level=b"\\x01", name=node.get_fully_qualified_name() + ": control", message="a word")
+for i in range(10**9):
+    state.publish(messages.named_numbers_message(i * 10**7, list(values), list(values.values())))
+    if i % 20 == 0:
+        diagnostics.publish(DiagnosticArray(status=[status]))
+    time.sleep(0.01)
+"""
+
+_ASK = """(() => {
+  const document_ = window.Bokeh && Bokeh.documents[0]; if (!document_) return null;
+  const state = document_.get_model_by_name("state"), words = document_.get_model_by_name("words");
+  const table = document_.get_model_by_name("diagnostics");
+  if (!state || !state.data.speed_mps.length || !table.data.name.length) return null;
+  const all = [...document_._all_models.values()];
+  return JSON.stringify({speed: state.data.speed_mps[state.data.speed_mps.length - 1], words: words.text,
+    status: [table.data.level[0], table.data.name[0], table.data.message[0]],
+    figures: all.filter(model => model.type === "Figure").length,
+    foreign: performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith(location.origin)
+      && !n.startsWith("data:") && !n.startsWith("blob:"))});
+})()"""
+
+
+def _read_page(url: str, folder: Path) -> dict[str, Any]:
+    """What the page's own script knows, asked by way of the DevTools protocol."""
+    assert BROWSER is not None
+    options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0"]
+    browser = subprocess.Popen(
+        [BROWSER, *options, "--remote-allow-origins=*", f"--user-data-dir={folder / 'browser'}", url],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        port_file = folder / "browser" / "DevToolsActivePort"
+        _until(lambda: port_file.exists() and port_file.read_text().count("\n") >= 1)
+        port = int(port_file.read_text().splitlines()[0])
+        answer = _until(lambda: _evaluate(port, url))
+        return dict(json.loads(answer))
+    finally:
+        browser.kill()
+        browser.wait()
+
+
+def _until(condition: Any) -> Any:
+    end = time.monotonic() + 90.0
+    while not (found := condition()):
+        assert time.monotonic() < end, "the page shows nothing"
+        time.sleep(0.2)
+    return found
+
+
+def _evaluate(port: int, url: str) -> str | None:
+    import asyncio
+    import urllib.request
+
+    from tornado.websocket import websocket_connect
+
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/json") as answer:
+        pages = [page for page in json.load(answer) if page.get("url") == url]
+    if not pages:
+        return None
+
+    async def ask() -> Any:
+        socket = await websocket_connect(pages[0]["webSocketDebuggerUrl"])
+        await socket.write_message(json.dumps({"id": 1, "method": "Runtime.evaluate", "params": {"expression": _ASK}}))
+        message = json.loads(await socket.read_message() or "{}")
+        socket.close()
+        return message["result"]["result"].get("value")
+
+    return asyncio.run(ask())
