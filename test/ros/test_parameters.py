@@ -107,13 +107,13 @@ def test_descriptors_carry_range_choices_and_when_it_may_change() -> None:
 
 
 def test_a_written_parameter_file_reads_back_as_the_defaults() -> None:
-    text = yaml_text("node", SPECS.values(), "All parameters.")
-    values = yaml.safe_load(text)["/**/node"]["ros__parameters"]
+    text = yaml_text(SPECS.values(), "All parameters.")
+    values = yaml.safe_load(text)["/**"]["ros__parameters"]
     big = values.pop("group")["big"]
     assert big == 1e6
     assert isinstance(big, float)
     assert values == {name: spec.default for name, spec in SPECS.items() if name != "group.big"}
-    assert text.startswith("# All parameters.\n/**/node:\n")
+    assert text.startswith("# All parameters.\n/**:\n")
 
 
 def test_the_table_has_a_row_for_each_parameter() -> None:
