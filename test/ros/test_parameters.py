@@ -8,6 +8,7 @@ import pytest
 import yaml
 from rclpy.parameter import Parameter
 
+from iwm_power_manager.control.thresholds import input_limits
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros.arguments import check_parameter_files
@@ -158,8 +159,9 @@ class TestPowerManager:
         assert config.law_settings(VALUES, "sdp") == default_settings("sdp")
 
     def test_in_lockstep_stamps_are_not_judged_by_the_clock(self) -> None:
-        assert config.input_limits(VALUES, 0.33).stamp == (0.1, 0.02)
-        limits = config.input_limits(VALUES | {"lockstep": True}, 0.33)
+        thresholds = config.thresholds_of(VALUES)
+        assert input_limits(thresholds, 0.33, by_clock=True).stamp == (0.1, 0.02)
+        limits = input_limits(thresholds, 0.33, by_clock=False)
         assert limits.stamp is None
         assert math.isinf(limits.demand_delay_s)
 
