@@ -204,7 +204,7 @@ def _overlap_s(spans: NDArray[np.float64], begin_s: float, end_s: float) -> floa
     return float(np.sum(np.maximum(np.minimum(near[:, 1], end_s) - np.maximum(near[:, 0], begin_s), 0.0)))
 
 
-class _Watch:
+class Watch:
     """Wakes on the processor of the thread that runs it; another thread puts away what it wrote.
 
     Parameters
@@ -224,6 +224,11 @@ class _Watch:
         self.run()  # compiles
         self._state[:] = 0
 
+    @property
+    def count(self) -> int:
+        """Wake-ups so far."""
+        return int(self._state[wake_ups.COUNT])
+
     def run(self) -> None:
         """Watch until `stop`."""
         wake_ups.wake_up(self._ring, self._state, self._pages, self._timespec, round(_TICK_S * 1e9))
@@ -240,10 +245,10 @@ class _Watch:
         IwmError
             It was called too late: wake-ups are lost.
         """
-        count = int(self._state[wake_ups.COUNT])
+        count = self.count
         numbers = np.arange(self._put_away, count) % len(self._ring)
         self._kept.append(self._ring[numbers])
-        if int(self._state[wake_ups.COUNT]) - self._put_away > len(self._ring):
+        if self.count - self._put_away > len(self._ring):
             raise IwmError("the witness's wake-ups were not put away in time")
         self._put_away = count
 
@@ -272,7 +277,7 @@ def _main() -> None:
     kind, number = sys.argv[1], int(sys.argv[2])
     gc.disable()
     ended = threading.Event()
-    watch = _Watch() if kind == "processor" else None
+    watch = Watch() if kind == "processor" else None
 
     def put_away() -> None:
         while not ended.wait(_PUT_AWAY_S):

@@ -73,11 +73,11 @@ def test_a_small_ring_keeps_the_last() -> None:
     assert np.all(np.diff(loop.ring[order, wake_ups.DUE]) > 0.9 * TICK_NS)
 
 
-def watch_for(watch: witness._Watch, ticks: int, *, put_away: bool) -> None:
+def watch_for(watch: witness.Watch, ticks: int, *, put_away: bool) -> None:
     thread = threading.Thread(target=watch.run)
     thread.start()
     deadline_s = time.monotonic() + 60.0
-    while watch._state[wake_ups.COUNT] < ticks:
+    while watch.count < ticks:
         assert time.monotonic() < deadline_s
         if put_away:
             watch.put_away()
@@ -87,17 +87,17 @@ def watch_for(watch: witness._Watch, ticks: int, *, put_away: bool) -> None:
 
 
 def test_what_is_put_away_in_time_is_complete() -> None:
-    watch = witness._Watch(rows=1000)
+    watch = witness.Watch(rows=1000)
     watch_for(watch, 2500, put_away=True)
     watch.put_away()
     watch.put_away()  # nothing twice
     found = watch.found()
-    assert len(found) == watch._state[wake_ups.COUNT] >= 2500
+    assert len(found) == watch.count >= 2500
     assert np.all(np.diff(found[:, wake_ups.DUE]) > 0)
 
 
 def test_what_is_put_away_too_late_is_told() -> None:
-    watch = witness._Watch(rows=10)
+    watch = witness.Watch(rows=10)
     watch_for(watch, 30, put_away=False)
     with pytest.raises(IwmError, match="put away in time"):
         watch.put_away()
