@@ -436,9 +436,7 @@ def test_a_wrong_parameter_gets_one_line_and_exit_code_1(
     assert error.startswith("recorder: ")
 
 
-def test_a_parameter_that_does_not_exist_is_refused(
-    tmp_path: Path, recorder: Callable[..., RecorderProcess]
-) -> None:
+def test_a_parameter_that_does_not_exist_is_refused(tmp_path: Path, recorder: Callable[..., RecorderProcess]) -> None:
     process = recorder(tmp_path / "bag", "topic:=[/speed]")
     process.process.wait(PATIENCE_S)
     assert "recorder: parameter topic is unknown; is topics meant?" in process.end()[1]
