@@ -33,8 +33,7 @@ ARGUMENTS = (
     ("vehicle_file", "config/vehicles/jalalmaab_2015.yaml", "Vehicle YAML."),
     ("policy_file", "policies", "Policy file, or folder with a bank of them."),
     ("lifecycle", "autostart", "autostart | managed | manual: who configures and activates."),
-    ("respawn", "false", "Start the node again when it ends by a fault."),
-    ("respawn_delay", "1.0", "Time before that, s."),
+    ("respawn", "false", "Start the node again, after a second, when it ends by a fault."),
     ("log_level", "info", "debug | info | warn | error."),
 )
 

@@ -60,14 +60,14 @@ class Announcements:
         """Tell that it takes long, again and again."""
         if elapsed_s > COMPILING_S and self._due("compiling"):
             self._logger.info(
-                f"compiling the control law: {elapsed_s:.0f} s so far; the next start finds it in the cache"
+                f"preparing for {elapsed_s:.0f} s so far: what the cache does not hold is compiled"
             )
 
     def prepared(self, prepared: Prepared) -> None:
         """Tell what was loaded."""
         vehicle, policies = prepared.vehicle, prepared.policies
         if prepared.elapsed_s > COMPILING_S:
-            self._logger.info(f"compiled in {prepared.elapsed_s:.1f} s")
+            self._logger.info(f"prepared in {prepared.elapsed_s:.1f} s")
         self._logger.info(f"vehicle {vehicle.name} ({vehicle.hash[:12]}); {policies.description()}")
         if policies.fallback_reason:
             self._logger.warning(
