@@ -21,6 +21,8 @@
       - {actuator: motor_front_left, dead: true, from_s: 2.0}
       - {message: power_demand, lost: true, from_s: 2.0}
     require:                                  # what must come out, by the names of `iwm_sim.road_measures`
+      split_rate: {at_least: 1.0}
+    aim:                                      # what is aimed at beyond that; said, and no failure
       stopping_distance_m: {at_most: 88.0}
 
 Between two places of a list friction jumps and grade is constant.
@@ -61,6 +63,7 @@ _KEYS = (
     "until",
     "faults",
     "require",
+    "aim",
 )
 _DEMANDS = {
     "accelerator": (0.0, 1.0, ""),
@@ -93,11 +96,12 @@ class Friction(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """What a measure has to be."""
+    """What a measure has to be, or, as an aim, should be."""
 
     measure: str
     at_least: float
     at_most: float
+    aim: bool = False
 
 
 @dataclass(frozen=True)
@@ -197,7 +201,7 @@ def load_scenario(name: Path | str, idle_drive: str | None = None) -> Scenario:
         soc=files.check_number(path, "start.soc", start.get("soc", 0.8), 0.0, 1.0),
         to_standstill=to_standstill,
         faults=_faults(path, content.get("faults", [])),
-        require=_require(path, content.get("require", {})),
+        require=(*_bounds(path, content, "require"), *_bounds(path, content, "aim")),
         about=" ".join(about.split()),
         path=str(path),
         described=f"{vehicle.name} in {path.stem}, idle drive {vehicle.idle_drive}",
@@ -338,15 +342,17 @@ def _fault(path: Path, where: str, entry: Any) -> Fault:
     return Fault(target, kind[0], value, from_s, until_s, what[0] == "message")
 
 
-def _require(path: Path, content: Any) -> tuple[Bound, ...]:
-    files.check_keys(path, content, (), NAMES, "require")
+def _bounds(path: Path, whole: Mapping[str, Any], section: str) -> list[Bound]:
+    content = files.check_keys(path, whole.get(section, {}), (), NAMES, section)
     bounds = []
     for name, bound in content.items():
-        where = f"require.{name}"
+        where = f"{section}.{name}"
         files.check_keys(path, bound, (), ("at_least", "at_most"), where)
         if not bound:
             raise ConfigError(path, where, "bounds nothing", "at_least, at_most")
         low = files.check_number(path, f"{where}.at_least", bound.get("at_least", -1e9))
         high = files.check_number(path, f"{where}.at_most", bound.get("at_most", 1e9), low)
-        bounds.append(Bound(name, low if "at_least" in bound else -math.inf, high if "at_most" in bound else math.inf))
-    return tuple(bounds)
+        least = low if "at_least" in bound else -math.inf
+        most = high if "at_most" in bound else math.inf
+        bounds.append(Bound(name, least, most, section == "aim"))
+    return bounds

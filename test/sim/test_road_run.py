@@ -117,6 +117,13 @@ def test_requirements_are_checked_and_said():
     assert not result.passed
     assert "FAIL  stop: A stop." in text(result)
     assert "! steering_deg" in text(result)
+    aims = tuple(bound._replace(aim=True) for bound in bounds)
+    aimed = result._replace(
+        checked=tuple(check._replace(bound=b) for check, b in zip(result.checked, aims, strict=True))
+    )
+    assert aimed.passed
+    assert "~ steering_deg" in text(aimed)
+    assert "aim missed" in page([aimed], "equal")
     written = page([result], "equal")
     assert "| `stop` | A stop. | `stopping_distance_m` |" in written
     assert "0 of 1 scenarios" in written

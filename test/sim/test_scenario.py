@@ -52,6 +52,7 @@ def test_a_full_file_becomes_what_it_says(tmp_path):
             {"actuator": "motor_rear_left", "dead": True},
             {"message": "vehicle_speed", "lost": True, "from_s": 3.0},
         ],
+        "aim": {"lane_m": {"at_most": 2.0}},
         "require": {"stopping_distance_m": {"at_most": 50.0}, "least_braking": {"at_least": 0.8, "at_most": 1.2}},
     }
     scenario = load_scenario(write(tmp_path, content))
@@ -72,6 +73,7 @@ def test_a_full_file_becomes_what_it_says(tmp_path):
     assert scenario.require == (
         Bound("stopping_distance_m", -math.inf, 50.0),
         Bound("least_braking", 0.8, 1.2),
+        Bound("lane_m", -math.inf, 2.0, aim=True),
     )
 
 
@@ -121,6 +123,7 @@ def test_a_cycle_and_a_vehicle_may_stand_beside_the_file(tmp_path):
             r"faults\[0\].until_s: 1.0 is out of range",
         ),
         ({"require": {"beauty": {"at_most": 1.0}}}, "require.beauty: is an unknown key"),
+        ({"aim": {"lane_m": 2.0}}, "aim.lane_m: 2.0 is no mapping"),
         ({"require": {"lane_m": {}}}, "require.lane_m: bounds nothing"),
         ({"require": {"lane_m": {"at_least": 2.0, "at_most": 1.0}}}, "require.lane_m.at_most"),
     ],
