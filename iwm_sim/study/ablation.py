@@ -114,8 +114,8 @@ def ablation(
             program,
             meaning,
             {
-                f"{cycle} {friction:g}": by[Place(cases.cycle_of(cycle).name, friction, "none")][program].saving_percent
-                for cycle, friction in places
+                f"{cycle} {friction:g}": by[Place(cycle, friction, "none")][program].saving_percent
+                for cycle, friction in ((cases.cycle_of(path).name, friction) for path, friction in places)
             },
         )
         for program, meaning in meanings.items()

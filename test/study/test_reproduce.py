@@ -34,7 +34,7 @@ def test_the_whole_study_runs_on_a_short_cycle(hill, tmp_path, small_grid, monke
     out = tmp_path / "out"
     made = reproduce.study(out, vehicle="jalalmaab_2015", policy=str(bank), jobs=1, quiet=True, cycles=(str(hill),))
     assert Study.load(out / "study.json") == made
-    assert len(made.cells) == 6 * 9
+    assert len(made.cells) == 6 * 10
     assert len(made.gates) == 6 * 2
     assert (out / "study.html").stat().st_size > 100_000
     assert len(list((out / "figures").glob("*.svg"))) == 10
