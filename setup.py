@@ -23,6 +23,7 @@ EXECUTABLES = {
     "power_manager": "iwm_power_manager.executables:power_manager",
     "recorder": "iwm_power_manager.executables:recorder",
     "replay": "iwm_power_manager.executables:replay",
+    "set_parameter": "iwm_power_manager.executables:set_parameter",
     "simulator": "iwm_sim.executables:simulator",
     "solve_policy": "iwm_power_manager.executables:solve_policy",
     "watch_car": "iwm_power_manager.executables:watch_car",

@@ -61,6 +61,11 @@ def replay() -> int:
     return run("iwm_power_manager.tools.replay", INTERRUPTED)
 
 
+def set_parameter() -> int:
+    """Command `set_parameter`."""
+    return run("iwm_power_manager.tools.set_parameter", INTERRUPTED)
+
+
 def solve_policy() -> int:
     """Command `solve_policy`."""
     return run("iwm_power_manager.tools.solve_policy", INTERRUPTED)

@@ -127,7 +127,7 @@ def load(plan: Plan) -> Loaded:
 def power_manager_parameters() -> dict[str, Any]:
     """Parameters of the power manager as its node gets them: defaults, and over them its file in `config/nodes`."""
     path = resolve(PARAMETER_FILES["power_manager"])
-    given = files.read_yaml(path).get("/**/power_manager", {}).get("ros__parameters", {})
+    given = files.read_yaml(path).get("/**", {}).get("ros__parameters", {})
     return {spec.name: given.get(spec.name, spec.default) for spec in power_manager_config.SPECS}
 
 

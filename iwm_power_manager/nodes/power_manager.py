@@ -197,8 +197,15 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         self.get_logger().error("a transition failed; the node is unconfigured again")
         return TransitionCallbackReturn.SUCCESS
 
-    def start(self) -> None:
-        """Configure and activate as soon as what that needs is prepared; `start_failed` if it is refused."""
+    def start(self) -> bool:
+        """Configure and activate, and wait for it; False if that was refused."""
+        return (
+            self.trigger_configure() == TransitionCallbackReturn.SUCCESS
+            and self.trigger_activate() == TransitionCallbackReturn.SUCCESS
+        )
+
+    def start_when_prepared(self) -> None:
+        """Begin to prepare; the executor then configures and activates. `start_failed` if that is refused."""
         self._starting = True
         self._prepare()
 
@@ -206,10 +213,7 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         """The next step on the way to active, once it is possible."""
         if not self.preparing:
             self._starting = False
-            self.start_failed = not (
-                self.trigger_configure() == TransitionCallbackReturn.SUCCESS
-                and self.trigger_activate() == TransitionCallbackReturn.SUCCESS
-            )
+            self.start_failed = not self.start()
 
     @property
     def preparing(self) -> bool:
@@ -639,7 +643,7 @@ def main(args: list[str] | None = None) -> int:
         node = PowerManager()
         interruption.started = True
         if node.get_parameter("autostart").value:
-            node.start()
+            node.start_when_prepared()
         _spin(node, interruption)
         code = 1 if node.start_failed and not interruption.requested else 0
     except KeyboardInterrupt:

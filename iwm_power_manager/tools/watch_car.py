@@ -1,4 +1,4 @@
-"""See a running car in the browser: one page, served on this machine only, fed by the power manager's topics alone.
+"""See a running car: one page in the browser, served on this machine only, or lines in the terminal; from topics alone.
 
 Charts and server are Bokeh's, whose scripts come from the same server: no network is needed.
 """
@@ -6,6 +6,7 @@ Charts and server are Bokeh's, whose scripts come from the same server: no netwo
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import itertools
 import sys
 import threading
@@ -68,19 +69,20 @@ class Feed:
         return list(newer)[::-1]
 
 
-def in_words(values: Mapping[str, float]) -> str:
-    """Mode, gate, limits and missing inputs of a step."""
+def in_words(values: Mapping[str, float]) -> list[str]:
+    """Mode, gate, limits and missing inputs of a step, and its main numbers."""
     limits = [name for bit, name in LIMIT_NAMES.items() if int(values["limits"]) & bit]
     missing = [name for bit, name in STALE_NAMES.items() if int(values["stale"]) & bit]
-    parts = [
-        f"mode: <b>{MODE_NAMES[int(values['mode'])]}</b>",
+    return [
+        f"mode: {MODE_NAMES[int(values['mode'])]}",
         f"gate: {GATE_NAMES[int(values['gate'])]}",
         f"limits that bind: {', '.join(limits) or 'none'}",
         f"missing: {', '.join(missing) or 'nothing'}",
-        f"speed {values['speed_mps']:.2f} m/s, demand {values['power_demand_w'] / 1e3:.2f} kW,"
-        f" front share {values['front_share']:.2f}, charge {100.0 * values['soc']:.1f} %",
+        f"speed {values['speed_mps']:.2f} m/s",
+        f"demand {values['power_demand_w'] / 1e3:.2f} kW",
+        f"front share {values['front_share']:.2f}",
+        f"charge {100.0 * values['soc']:.1f} %",
     ]
-    return " &nbsp;·&nbsp; ".join(parts)
 
 
 def charts(names: Sequence[str]) -> dict[str, dict[str, str]]:
@@ -130,7 +132,7 @@ def make_page(document: Any, feed: Feed) -> None:
         rows = feed.since(seen)
         if rows:
             seen = rows[-1].number
-            words.text = in_words(rows[-1].values)
+            words.text = " &nbsp;·&nbsp; ".join(in_words(rows[-1].values))
             found: dict[str, Any] = {
                 name: [row.values.get(name, float("nan")) for row in rows] for name in ("time_s", *signals)
             }
@@ -205,6 +207,27 @@ def serve(feed: Feed, port: int, *, open_browser: bool) -> None:
     server.stop()
 
 
+def report(feed: Feed) -> str:
+    """What there is to say in a terminal: one line of the last step, one for each status that is not ok."""
+    rows = list(feed.rows)
+    lines = [" | ".join(in_words(rows[-1].values)) if rows else "nothing heard yet"]
+    lines += [
+        f"  {level:5} {name}: {text}" for name, (level, text) in sorted(feed.statuses.items()) if level != LEVELS[0]
+    ]
+    return "\n".join(lines)
+
+
+def print_reports(feed: Feed) -> None:
+    """Print a report a second until Ctrl-C or SIGTERM."""
+    import signal
+
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
+    while not ended.wait(1.0):
+        print(report(feed), flush=True)
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the page; returns the exit code."""
     parser = argparse.ArgumentParser(
@@ -213,13 +236,12 @@ def main(args: Sequence[str] | None = None) -> int:
         epilog="ROS arguments may follow: --ros-args -r __ns:=/car_1 -r power_manager/state:=my_node/state",
     )
     parser.add_argument("--port", type=int, default=8321, help="port on this machine (default 8321; 0: any)")
+    parser.add_argument("--terminal", action="store_true", help="no page: print state and diagnostics once a second")
     parser.add_argument("--no-browser", action="store_true", help="only serve, and print the address")
     given = list(sys.argv[1:] if args is None else args)
     own = given[: given.index("--ros-args")] if "--ros-args" in given else given
     options = parser.parse_args(own)
-    try:
-        import bokeh  # noqa: F401 - named here, before anything has begun
-    except ImportError:
+    if not options.terminal and importlib.util.find_spec("bokeh") is None:
         print("watch_car: needs the package bokeh (python3-bokeh-pip, or pip install bokeh)", file=sys.stderr)
         return 1
     from iwm_power_manager.ros import ending
@@ -228,7 +250,10 @@ def main(args: Sequence[str] | None = None) -> int:
     node, thread, executor = listen(feed, ["watch_car", *given[len(own) :]])
     code = 1
     try:
-        serve(feed, options.port, open_browser=not options.no_browser)
+        if options.terminal:
+            print_reports(feed)
+        else:
+            serve(feed, options.port, open_browser=not options.no_browser)
         code = 0
     except IwmError as error:
         print(f"watch_car: {error}", file=sys.stderr)

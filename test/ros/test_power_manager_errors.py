@@ -10,6 +10,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
 from iwm_power_manager.control.controller import ControlFaultError
+from iwm_power_manager.nodes import preparation
 from iwm_power_manager.ros import messages, qos
 
 
@@ -26,13 +27,14 @@ def faults(node) -> list[str]:
 
 
 def test_an_error_while_configuring_leads_to_unconfigured_and_can_be_overcome(node, monkeypatch) -> None:
-    def broken() -> None:
+    def broken(_values) -> None:
         raise RuntimeError("out of luck")
 
     with monkeypatch.context() as patch:
-        patch.setattr(node, "_build", broken)
-        assert node.trigger_configure() == TransitionCallbackReturn.ERROR
+        patch.setattr(preparation, "prepare", broken)
+        assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
         assert node._lifecycle_state() == "unconfigured"
+        assert faults(node) == ["RuntimeError: out of luck"]
         assert node.count_publishers(messages.WHEEL_TORQUE_COMMAND) == 0
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     assert node._lifecycle_state() == "inactive"

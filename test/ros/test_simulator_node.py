@@ -386,7 +386,7 @@ def test_topics_follow_namespace_and_remaps(tmp_path, hill) -> None:
 
 
 def test_the_shipped_parameter_file_holds_its_defaults() -> None:
-    given = read_yaml(resolve("config/nodes/simulator.yaml"))["/**/simulator"]["ros__parameters"]
+    given = read_yaml(resolve("config/nodes/simulator.yaml"))["/**"]["ros__parameters"]
     defaults = {spec.name: spec.default for spec in PARAMETERS}
     assert {name: defaults[name] for name in given} == given
 

@@ -38,10 +38,24 @@ def test_a_page_gets_each_drawn_step_once_and_in_order() -> None:
 
 
 def test_mode_gate_limits_and_missing_inputs_stand_in_words() -> None:
-    text = in_words(values(mode=2.0, gate=1.0, limits=66.0, stale=9.0, speed_mps=3.0, power_demand_w=1500.0, soc=0.5))
-    for part in ("<b>degraded</b>", "gate: front", "regeneration, slip", "vehicle_speed, battery_state", "1.50 kW"):
+    text = " ".join(
+        in_words(values(mode=2.0, gate=1.0, limits=66.0, stale=9.0, speed_mps=3.0, power_demand_w=1500.0, soc=0.5))
+    )
+    for part in ("mode: degraded", "gate: front", "regeneration, slip", "vehicle_speed, battery_state", "1.50 kW"):
         assert part in text
     assert "limits that bind: none" in in_words(values())
+
+
+def test_the_terminal_gets_the_last_step_and_what_is_not_ok() -> None:
+    feed = Feed()
+    assert watch_car.report(feed) == "nothing heard yet"
+    for _ in range(EVERY):
+        feed.state(0, values(mode=1.0, speed_mps=2.0))
+    feed.status("/a: control", 0, "normal")
+    feed.status("/a: inputs", 2, "battery_state is missing")
+    first, second = watch_car.report(feed).splitlines()
+    assert first.startswith("mode: normal | gate: none")
+    assert second.split(maxsplit=1) == ["error", "/a: inputs: battery_state is missing"]
 
 
 def test_every_line_of_the_charts_is_a_signal_of_the_state() -> None:
@@ -87,7 +101,7 @@ def test_the_page_shows_a_running_car(tmp_path: Path) -> None:
         assert url is not None
         found = _read_page(url[0], tmp_path)
         assert found["speed"] == pytest.approx(12.5)
-        assert "<b>normal</b>" in found["words"]
+        assert "mode: normal" in found["words"]
         assert found["status"] == ["warn", f"{name}/power_manager: control", "a word"]
         assert found["figures"] == len(charts(SIGNAL_NAMES))
         assert found["foreign"] == []
