@@ -106,6 +106,9 @@ class PlantState(NamedTuple):
     energies: Energies
 
 
+#: Below this speed, m/s, a motor gives its torque either way: no regeneration is worth anything there.
+STANDSTILL_MPS = 0.1
+
 #: Fields of a `PlantState` that hold a number for each wheel.
 OF_WHEELS = ("wheel_speed_radps", "heat", "motor_torque_nm", "friction_torque_nm")
 
@@ -194,11 +197,11 @@ def obeyed_torque_nm(command_nm: float, wheel_speed_radps: float, speed_mps: flo
     """What a motor makes of a command: it saturates at its own limits.
 
     A torque against the car's way forwards is regeneration, with its limits; all others are the motor's full torque:
-    forwards whichever way the car rolls, backwards from rest on.
+    forwards whichever way the car rolls, backwards from all but standstill on.
     """
     turning = abs(wheel_speed_radps)
     most = torque_limit_nm(turning, heat, motor)
-    least = -regeneration_limit_nm(turning, speed_mps, heat, motor) if speed_mps > 0.0 else -most
+    least = -regeneration_limit_nm(turning, speed_mps, heat, motor) if speed_mps > STANDSTILL_MPS else -most
     return min(max(command_nm, least), most)
 
 

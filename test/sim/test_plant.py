@@ -99,7 +99,7 @@ def test_a_pack_without_polarisation_is_a_source_behind_a_resistance():
 @given(st.floats(-300.0, 300.0), st.floats(-150.0, 150.0), st.floats(-10.0, 40.0), st.floats(0.0, 1.2))
 def test_a_motor_obeys_as_far_as_it_can(command, wheel, speed, heat):
     high = physics.torque_limit(abs(wheel), heat, CAR.front.motor)
-    low = -physics.regeneration_limit(abs(wheel), speed, heat, CAR.front.motor) if speed > 0.0 else -high
+    low = -physics.regeneration_limit(abs(wheel), speed, heat, CAR.front.motor) if speed > 0.1 else -high
     assert obeyed_torque_nm(command, wheel, speed, heat, CAR.front.motor) == pytest.approx(
         min(max(command, low), high), abs=1e-9
     )
