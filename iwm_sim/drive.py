@@ -239,7 +239,9 @@ class Drive:
         speed = self.car.speed_mps
         floor = self._params.driver.power_speed_floor_mps
         force_n = self._look().brake * full_braking_w(speed, self._params) / max(speed, floor)
-        return (-force_n * self._params.front.wheel.radius_m / 4.0,) * 4
+        front = -force_n * self._params.front.wheel.radius_m / 4.0
+        rear = -force_n * self._params.rear.wheel.radius_m / 4.0
+        return front, front, rear, rear
 
     def run(self) -> Run:
         """What has been driven so far."""

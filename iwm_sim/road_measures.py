@@ -140,7 +140,8 @@ def longest_beyond_critical_s(d: Driven) -> float:
 
 def longest_spinning_s(d: Driven) -> float:
     """Longest time that one wheel's driving slip is beyond 0.2 with a rim faster than 1 m/s over ground."""
-    rims = d.wheels("wheel_{}_radps") * d.vehicle.front.wheel.radius_m
+    front, rear = d.vehicle.front.wheel.radius_m, d.vehicle.rear.wheel.radius_m
+    rims = d.wheels("wheel_{}_radps") * np.array([front, front, rear, rear])
     over = rims - d["speed_mps"][:, None]
     spinning = (d.wheels("slip_{}") > -CRITICAL_SLIP) & (over > MOVING_MPS)
     return max(longest_s(spinning[:, i], d.run.dt_s) for i in range(4))
