@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""What it costs to turn the bytes of the four inputs into readings: the signals' readers beside rclpy's decoding.
+"""What it costs to turn bytes into readings and commands into bytes: the signals' code beside rclpy's.
 
-Both see the same bytes, turn about, in one process; the ratio is that of the fastest rounds.
+Both do the same work, turn about, in one process; the ratio is that of the fastest rounds.
 """
 
 from __future__ import annotations
@@ -9,14 +9,18 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 from rclpy.serialization import deserialize_message, serialize_message
 
+from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.ros import messages
+from iwm_power_manager.signals.commands import FRICTION, MOTOR, CommandWriter, standard
 from iwm_power_manager.signals.contract import BATTERY_STATE, POWER_DEMAND, VEHICLE_SPEED, WHEEL_NAMES, WHEEL_STATES
 from iwm_power_manager.signals.mapping import load_mapping
-from iwm_power_manager.signals.readings import Assembly, topic_readers
+from iwm_power_manager.signals.readings import Assembly, joint_state_writer, topic_readers
 from iwm_power_manager.signals.types import types_of
 
 _TOPICS = (VEHICLE_SPEED, WHEEL_STATES, BATTERY_STATE, POWER_DEMAND)
@@ -56,13 +60,27 @@ def contenders() -> dict[str, Callable[[dict[str, bytes]], object]]:
     }
 
 
-def fastest_us(names: list[str], rounds: int, steps: list[dict[str, bytes]]) -> dict[str, float]:
-    """Time for the inputs of one step, us, in the fastest round of each contender."""
-    ways = contenders()
-    best = dict.fromkeys(names, float("inf"))
+def writers() -> dict[str, Callable[[object], object]]:
+    """Functions that make the bytes of one step's two commands and of its state."""
+    write = [CommandWriter(Path("standard.yaml"), standard()[kind]) for kind in (MOTOR, FRICTION)]
+    write_state = joint_state_writer(SIGNAL_NAMES, "position")
+    torques, numbers = (1.0, 2.0, 3.0, 4.0), [1.0] * len(SIGNAL_NAMES)
+
+    def by_message(_: object) -> object:
+        made = [messages.torque_command_message(5, WHEEL_NAMES, torques) for _ in write]
+        return [serialize_message(m) for m in (*made, messages.named_numbers_message(5, SIGNAL_NAMES, numbers))]
+
+    return {
+        "signals": lambda _: [one(5, torques) for one in write] + [write_state(5, numbers)],
+        "rclpy": by_message,
+    }
+
+
+def fastest_us(ways: dict[str, Callable[[Any], object]], rounds: int, steps: Sequence[Any]) -> dict[str, float]:
+    """Time for one step, us, in the fastest round of each way."""
+    best = dict.fromkeys(ways, float("inf"))
     for _ in range(rounds):
-        for name in names:
-            way = ways[name]
+        for name, way in ways.items():
             started = time.perf_counter()
             for step in steps:
                 way(step)
@@ -71,15 +89,16 @@ def fastest_us(names: list[str], rounds: int, steps: list[dict[str, bytes]]) -> 
 
 
 def main() -> int:
-    """Print both times and their ratio."""
+    """Print both times and their ratio, for inputs and outputs."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--steps", type=int, default=2000)
     options = parser.parse_args()
-    best = fastest_us(["signals", "rclpy"], options.rounds, inputs(options.steps))
-    for name, value in best.items():
-        print(f"{name:8} {value:6.2f} us for the four inputs of a step")
-    print(f"ratio rclpy / signals: {best['rclpy'] / best['signals']:.2f}")
+    steps = inputs(options.steps)
+    for what, ways in (("four inputs", contenders()), ("two commands and the state", writers())):
+        best = fastest_us(ways, options.rounds, steps)
+        print(f"{what}: signals {best['signals']:.2f} us, rclpy {best['rclpy']:.2f} us, ", end="")
+        print(f"ratio {best['rclpy'] / best['signals']:.1f}")
     return 0
 
 

@@ -112,7 +112,7 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         self._write_state: MessageWriter | None = None
         self._topics: dict[str, tuple[str, ...]] = {}
         self._msgtypes: dict[str, str] = {}
-        self._mismatches: dict[str, str] = {}
+        self._unheard: dict[str, str] = {}
         self._preparation: Preparation | None = None
         self._prepared: Future | None = None
         self._starting = False
@@ -333,7 +333,7 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         self._demand_reader = None
         self._commands = {}
         self._command_topics = []
-        self._mismatches = {}
+        self._unheard = {}
         self._controller = None
         self._stepper = None
         self._policies = None
@@ -572,7 +572,7 @@ class PowerManager(KeepsItsValues, LifecycleNode):
                 self._command_zero()
             elif self._fault and self._stepper is not None and self._stepper.last_ns is not None:
                 self._fault = ""
-            self._says.stepped(controller, self._topics, self._mismatches)
+            self._says.stepped(controller, self._topics, self._unheard)
         shown = controller and (controller.supervision.mode, controller.supervision.stale, controller.wheels_lost)
         gate = controller and controller.command and controller.command.gate
         if self._changes.changed((self._active, self._fault, shown, gate), time.monotonic()):
@@ -621,10 +621,15 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         values = {f"{topic}: publishers": str(count) for topic, count in counts.items()}
         level = diagnostics.ERROR if problems else diagnostics.OK
         statuses = [diagnostics.Status("command topics", level, "; ".join(problems) or "ok", values)]
-        self._mismatches = mismatched_publishers(self, self._intake.subscriptions(), self._msgtypes)
-        unheard = [f"{topic}: {why}" for topic, why in self._mismatches.items()]
-        if unheard:
-            statuses.append(diagnostics.Status("input topics", diagnostics.ERROR, "; ".join(unheard), {}))
+        subscriptions = self._intake.subscriptions()
+        mismatches = mismatched_publishers(self, subscriptions, self._msgtypes)
+        unheard = [f"{topic}: {why}" for topic, why in mismatches.items()]
+        senders = {found.topic_name: self.count_publishers(found.topic_name) for found in subscriptions}
+        self._unheard = {topic: "no publisher" for topic, count in senders.items() if not count} | mismatches
+        several = [f"{topic} has {count} publishers" for topic, count in senders.items() if count > 1]
+        if unheard or several:
+            level = diagnostics.ERROR if unheard else diagnostics.WARN
+            statuses.append(diagnostics.Status("input topics", level, "; ".join([*unheard, *several]), {}))
         self._says.problems([*problems, *unheard])
         return statuses
 

@@ -23,8 +23,8 @@ SCRIPTS = sorted(
 
 #: Python modules that come with ROS under the name of their package.
 ROS_MODULES = {
-    "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "launch", "launch_ros", "lifecycle_msgs", "nav_msgs",
-    "rcl_interfaces", "rclpy", "rosgraph_msgs", "sensor_msgs", "std_msgs", "std_srvs",
+    "ament_index_python", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "launch", "launch_ros",
+    "lifecycle_msgs", "nav_msgs", "rcl_interfaces", "rclpy", "rosgraph_msgs", "sensor_msgs", "std_msgs", "std_srvs",
 }  # fmt: skip
 #: Other imports, and the rosdep key that brings them.
 ROSDEP_KEYS = {
@@ -97,7 +97,7 @@ def test_the_version_is_the_same_everywhere(manifest: Package) -> None:
 
 
 def test_the_manifest_names_every_ros_package_and_library_that_is_imported(manifest: Package) -> None:
-    imported = third_party() | {"launch", "launch_ros"}
+    imported = third_party() | {"ament_index_python", "launch", "launch_ros"}
     unknown = imported - ROS_MODULES - set(ROSDEP_KEYS)
     assert not unknown, f"say in this test which rosdep key brings {unknown}"
     needed = {ROSDEP_KEYS.get(name, name) for name in imported}

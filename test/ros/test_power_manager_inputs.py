@@ -184,6 +184,13 @@ class TestDiagnostics:
         bench.node.destroy_publisher(intruder)
         bench.drive(lambda: bench.status("command topics").level == DiagnosticStatus.OK, "quiet again")
 
+    def test_a_second_publisher_of_an_input_is_warned_of(self, bench) -> None:
+        kind = messages.TOPIC_TYPES[messages.POWER_DEMAND]
+        intruder = bench.node.create_publisher(kind, messages.POWER_DEMAND, qos.profile(lockstep=False))
+        found = bench.drive(lambda: bench.status("input topics"), "the warning")
+        assert (found.level, "power_demand has 2 publishers" in found.message) == (DiagnosticStatus.WARN, True)
+        bench.node.destroy_publisher(intruder)
+
     def test_a_publisher_with_weaker_quality_of_service_is_named(self, start_pair) -> None:
         pair = start_pair({"qos_overrides.{namespace}/power_demand.subscription.reliability": "reliable"})
         bench = pair.bench

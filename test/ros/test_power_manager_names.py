@@ -39,6 +39,13 @@ def test_the_log_tells_the_way_from_start_to_end(start_pair) -> None:
         lambda _: None,
         rclpy.qos.QoSProfile(depth=1, durability=rclpy.qos.DurabilityPolicy.TRANSIENT_LOCAL),
     )
+    silent = bench.publishers.pop(messages.BATTERY_STATE)
+    bench.node.destroy_publisher(silent)
+    bench.spin_until(lambda: lines_with(running, "battery_state (no publisher)"), "what it waits for, and why")
+    battery = messages.TOPIC_TYPES[messages.BATTERY_STATE]
+    bench.publishers[messages.BATTERY_STATE] = bench.node.create_publisher(
+        battery, messages.BATTERY_STATE, qos.profile(lockstep=False)
+    )
     bench.spin_until(lambda: len(lines_with(running, "waits for")) > 1, "the second word of what it waits for")
     waits = lines_with(running, "waits for")[0]
     assert all(name in waits for name in ("vehicle_speed", "wheel_states", "power_demand", "battery_state"))
