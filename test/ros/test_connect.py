@@ -100,24 +100,7 @@ def test_a_car_with_odometry_pedals_and_foreign_joints_drives_and_brakes(connect
     assert torque_nm(last("wheel_torque_command")) < 0.0
 
 
-FOUR_TOPICS = """
-signals:
-  speed: {topic: speed_kmh, type: geometry_msgs/msg/Twist, field: linear.x, unit: km/h}
-  wheel_speed:
-    - {topic: rpm_0, type: std_msgs/msg/Float64, field: data, unit: rpm}
-    - {topic: rpm_1, type: std_msgs/msg/Float64, field: data, unit: rpm, sign: -1}
-    - {topic: rpm_2, type: std_msgs/msg/Float64, field: data, unit: rpm}
-    - {topic: rpm_3, type: std_msgs/msg/Float64, field: data, unit: rpm, sign: -1}
-  acceleration_demand: {topic: wanted, type: geometry_msgs/msg/AccelStamped, field: accel.linear.x, unit: m/s2}
-  soc: {topic: charge, type: std_msgs/msg/Float64, field: data, unit: "%"}
-commands:
-  motor_torque:
-    - {topic: torque_0, type: std_msgs/msg/Float64, field: data, unit: N m}
-    - {topic: torque_1, type: std_msgs/msg/Float64, field: data, unit: N m, sign: -1}
-    - {topic: torque_2, type: std_msgs/msg/Float64, field: data, unit: N m}
-    - {topic: torque_3, type: std_msgs/msg/Float64, field: data, unit: N m, sign: -1}
-  friction_torque: none
-"""
+FOUR_TOPICS = share_path("config/signals/four_topics.yaml").read_text()
 
 
 def test_a_car_with_four_rpm_topics_and_an_acceleration_demand_starts_from_rest(

@@ -19,9 +19,9 @@ def mapping_file(folder: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["standard.yaml", "odometry_and_pedals.yaml"])
+@pytest.mark.parametrize("name", ["standard.yaml", "odometry_and_pedals.yaml", "four_topics.yaml"])
 def test_the_mappings_of_the_package_are_valid(name: str) -> None:
-    assert "speed" in load_mapping(share_path(f"config/signals/{name}")).sources
+    load_mapping(share_path(f"config/signals/{name}")).check_live()
 
 
 def test_a_mapping_of_the_first_format_still_loads(tmp_path: Path) -> None:
