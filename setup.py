@@ -19,6 +19,8 @@ NAME = str(MANIFEST.findtext("name"))
 EXECUTABLES = {
     "demo": "iwm_sim.executables:demo",
     "evaluate": "iwm_sim.executables:evaluate",
+    "import_cycle": "iwm_power_manager.executables:import_cycle",
+    "import_motor": "iwm_power_manager.executables:import_motor",
     "learn_policy": "iwm_sim.executables:learn_policy",
     "power_manager": "iwm_power_manager.executables:power_manager",
     "recorder": "iwm_power_manager.executables:recorder",

@@ -46,6 +46,16 @@ def run(module: str, interrupted: int) -> int:
             signal.signal(number, signal.SIG_IGN)
 
 
+def import_cycle() -> int:
+    """Command `import_cycle`."""
+    return run("iwm_power_manager.tools.import_cycle", INTERRUPTED)
+
+
+def import_motor() -> int:
+    """Command `import_motor`."""
+    return run("iwm_power_manager.tools.import_motor", INTERRUPTED)
+
+
 def power_manager() -> int:
     """Node `power_manager`."""
     return run("iwm_power_manager.nodes.power_manager", NODE_ENDED)

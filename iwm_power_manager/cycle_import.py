@@ -1,0 +1,279 @@
+"""A drive cycle out of a logged drive: units, gaps, noise. What is guessed or left out is said."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from iwm_power_manager.cycle import MAX_GRADE, Cycle, at_rest, make_cycle
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.tables import Table, read_table
+from iwm_power_manager.trace_units import SPEED_UNITS, TIME_UNITS, FloatArray, implausible, likely_units
+
+#: What to do about a gap longer than `max_gap_s`.
+GAPS = ("refuse", "bridge", "cut")
+#: At a cut, the speed goes from one piece's end to the next one's start at this, m/s2.
+JOINT_MPS2 = 1.0
+#: A log that shows more than this below zero drives backwards, or has another sign.
+_BACKWARDS_MPS = 0.5
+_UNIT_NAMES = {
+    "km/h": r"km\W?/?h|kph|kmh",
+    "mph": r"mph|mi/h",
+    "kn": r"\bkn\b|knot",
+    "cm/s": r"cm/s|cmps",
+    "m/s": r"m/s|mps|m\W?s-1",
+}
+_TIME_NAMES = {
+    "ns": r"\bns\b|_ns",
+    "us": r"\bus\b|_us|µs",
+    "ms": r"\bms\b|_ms|milli",
+    "min": r"\bmin\b|minutes",
+    "s": r"\[s\]|\(s\)|_s\b|sec",
+}
+
+
+@dataclass
+class Log:
+    """A logged speed, in SI units.
+
+    Attributes
+    ----------
+    time_s, speed_mps, grade : of the samples that are usable, times rising from 0
+    speed_unit, time_unit : of the file
+    said : what was guessed or left out, one line each
+    """
+
+    name: str
+    time_s: FloatArray
+    speed_mps: FloatArray
+    grade: FloatArray
+    speed_unit: str
+    time_unit: str
+    said: list[str] = field(default_factory=list)
+
+    @property
+    def step_s(self) -> float:
+        """The usual distance of two samples."""
+        return float(np.median(np.diff(self.time_s)))
+
+    def gaps(self, longer_s: float) -> list[tuple[float, float]]:
+        """Start and length of every gap."""
+        at = np.flatnonzero(np.diff(self.time_s) > longer_s)
+        return [(float(self.time_s[i]), float(self.time_s[i + 1] - self.time_s[i])) for i in at]
+
+    def noise_mps(self) -> float:
+        """Scatter of the speed about its own trend, rms, from third differences; only where the car moves."""
+        third = np.diff(self.speed_mps, 3)
+        moving = (self.speed_mps[3:] > 0.5) & (np.diff(self.time_s, 1)[2:] <= 1.5 * self.step_s)
+        # The third difference of white noise has twenty times its variance; the median is not moved by manoeuvres.
+        return float(np.median(np.abs(third[moving])) / 0.6745 / np.sqrt(20.0)) if np.any(moving) else 0.0
+
+
+def read_log(
+    path: Path | str,
+    *,
+    time: str = "",
+    speed: str = "",
+    grade: str = "",
+    time_unit: str = "auto",
+    speed_unit: str = "auto",
+    separator: str = "auto",
+    decimal: str = "auto",
+) -> Log:
+    """Read a log's table.
+
+    Parameters
+    ----------
+    time, speed, grade : names of the columns; "" finds time and speed by their names, and no grade
+    time_unit : a unit of `TIME_UNITS`, "clock" (dates or hours:minutes:seconds), or auto
+    speed_unit : a unit of `SPEED_UNITS`, or auto: by the column's name, else by the accelerations
+    separator, decimal : see `tables.read_table`
+
+    Raises
+    ------
+    ConfigError
+        Nothing usable, a column that is not there, a text that is no number, units that cannot be told.
+    """
+    table = read_table(path, separator, decimal)
+    line, header = table.rows[0]
+    columns = {
+        "time": _column(table, header, time, r"time|stamp|\bt\b|zeit"),
+        "speed": _column(table, header, speed, r"speed|veloc|\bv\b|geschw|vitesse"),
+    }
+    if grade:
+        columns["grade"] = _column(table, header, grade, "")
+    said = [f"columns: {', '.join(f'{name} is {header[i]!r}' for name, i in columns.items())}"]
+    if table.decimal == ",":
+        said.append("decimal commas")
+    values: dict[str, list[float]] = {name: [] for name in columns}
+    clock = time_unit == "clock" or (time_unit == "auto" and _is_clock(table.rows[1:2], columns["time"]))
+    left_out = 0
+    for line, cells in table.rows[1:]:
+        row = {name: cells[i] if i < len(cells) else "" for name, i in columns.items()}
+        if any(text.lower() in ("", "nan", "null", "none", "-", "n/a", "na") for text in row.values()):
+            left_out += 1
+            continue
+        for name, text in row.items():
+            read = (
+                _clock_s(table, line, text)
+                if name == "time" and clock
+                else table.number(line, text, header[columns[name]])
+            )
+            values[name].append(read)
+    arrays = {name: np.array(found) for name, found in values.items()}
+    arrays.setdefault("grade", np.zeros(arrays["time"].size))
+    good = np.all([np.isfinite(x) for x in arrays.values()], axis=0)
+    left_out += int(np.count_nonzero(~good))
+    arrays = {name: x[good] for name, x in arrays.items()}
+    if left_out:
+        said.append(f"{left_out} rows without a value left out")
+    if arrays["time"].size:
+        before = np.maximum.accumulate(arrays["time"])
+        rising = np.concatenate(([True], arrays["time"][1:] > before[:-1]))
+        if not np.all(rising):
+            said.append(f"{int(np.count_nonzero(~rising))} rows whose time does not rise left out")
+        arrays = {name: x[rising] for name, x in arrays.items()}
+    if arrays["time"].size < 2:
+        raise ConfigError(path, "", f"has {arrays['time'].size} usable rows", "two or more")
+    if np.max(np.abs(arrays["grade"])) > MAX_GRADE:
+        problem = f"{header[columns['grade']]} reaches {np.max(np.abs(arrays['grade'])):g}: percent or degrees?"
+        raise ConfigError(path, "", problem, f"rise over run, -{MAX_GRADE:g} to {MAX_GRADE:g}")
+    return _in_si(path, arrays, header, columns, "clock" if clock else time_unit, speed_unit, said)
+
+
+def _column(table: Table, header: list[str], name: str, pattern: str) -> int:
+    wanted = [i for i, cell in enumerate(header) if (cell == name if name else re.search(pattern, cell, re.IGNORECASE))]
+    if not wanted:
+        problem = f"has no column {name!r}" if name else "has no column that looks like it: name it"
+        raise ConfigError(table.path, "line 1", problem, ", ".join(header))
+    return wanted[0]
+
+
+def _is_clock(rows: list[tuple[int, list[str]]], column: int) -> bool:
+    return any(column < len(cells) and re.search(r"[0-9]:[0-9]", cells[column]) for _, cells in rows)
+
+
+def _clock_s(table: Table, line: int, text: str) -> float:
+    """Seconds of a date with time, or of hours:minutes:seconds."""
+    plain = text.replace(",", ".")
+    parts = re.fullmatch(r"([0-9]{1,3}):([0-9]{2})(?::([0-9]{2}(?:\.[0-9]{1,9})?))?", plain, re.ASCII)
+    if parts:
+        return 3600.0 * int(parts[1]) + 60.0 * int(parts[2]) + float(parts[3] or 0.0)
+    try:
+        moment = datetime.datetime.fromisoformat(plain)
+        return (moment.replace(tzinfo=moment.tzinfo or datetime.UTC)).timestamp()
+    except (ValueError, OverflowError):
+        raise ConfigError(
+            table.path, f"line {line}", f"{text!r} is no time", "2026-03-01T12:00:00.1 | 12:00:00.1"
+        ) from None
+
+
+def _named(text: str, names: dict[str, str]) -> str:
+    return next((unit for unit, pattern in names.items() if re.search(pattern, text, re.IGNORECASE)), "")
+
+
+def _in_si(
+    path: Path | str,
+    arrays: dict[str, FloatArray],
+    header: list[str],
+    columns: dict[str, int],
+    time_unit: str,
+    speed_unit: str,
+    said: list[str],
+) -> Log:
+    time, speed = arrays["time"] - arrays["time"][0], arrays["speed"]
+    units = {"time": "s" if time_unit == "clock" else time_unit, "speed": speed_unit}
+    for name, names in (("time", _TIME_NAMES), ("speed", _UNIT_NAMES)):
+        if units[name] == "auto" and _named(header[columns[name]], names):
+            units[name] = _named(header[columns[name]], names)
+            said.append(f"{name} in {units[name]}, as the column's name says")
+    guess = [name for name in units if units[name] == "auto"]
+    if guess:
+        known_time = TIME_UNITS.get(units["time"], 1.0) if units["time"] != "auto" else 1.0
+        known_speed = SPEED_UNITS.get(units["speed"], 1.0) if units["speed"] != "auto" else 1.0
+        found = likely_units(time * known_time, np.maximum(speed * known_speed, 0.0))
+        if found is None:
+            raise ConfigError(path, "", f"its {' and '.join(guess)} look like driving in no unit", "name the unit")
+        for name, unit in zip(("speed", "time"), found, strict=True):
+            if name in guess:
+                units[name] = unit
+                said.append(f"{name} in {unit}: guessed from the accelerations; --{name}-unit says otherwise")
+    time = time * TIME_UNITS[units["time"]]
+    speed = at_rest(speed * SPEED_UNITS[units["speed"]])
+    lowest = float(np.min(speed))
+    if lowest < -_BACKWARDS_MPS:
+        raise ConfigError(path, "", f"its speed falls to {lowest:.3g} m/s: driving backwards is no cycle", ">= 0")
+    if lowest < 0.0:
+        said.append(f"speeds below zero, down to {lowest:.2g} m/s, taken for rest")
+        speed = np.maximum(speed, 0.0)
+    return Log(Path(path).stem, time, speed, arrays["grade"], units["speed"], units["time"], said)
+
+
+def to_cycle(log: Log, gaps: str, max_gap_s: float, smooth_s: float, rate_hz: float) -> Cycle:
+    """A cycle of a log.
+
+    Parameters
+    ----------
+    gaps : refuse, bridge (a straight line) or cut (the gap's time is left out, the pieces are joined at `JOINT_MPS2`)
+    max_gap_s : shorter ones are bridged
+    smooth_s : width (standard deviation) of the bell the speed is smoothed with; 0 leaves it
+    rate_hz : samples a second; 0 keeps the log's own
+
+    Raises
+    ------
+    ConfigError
+        Gaps that are not wanted, or a result no car drives.
+    """
+    found = log.gaps(max_gap_s)
+    if found and gaps == "refuse":
+        start, length = max(found, key=lambda gap: gap[1])
+        problem = f"has {len(found)} gaps, the longest of {length:.4g} s from {start:.6g} s"
+        raise ConfigError(log.name, "", problem, "--gaps bridge, --gaps cut, or a larger --max-gap")
+    time: FloatArray = log.time_s
+    speed, grade = log.speed_mps, log.grade
+    if gaps == "cut":
+        time = _without_gaps(time, speed, max_gap_s, log.step_s)
+    if smooth_s > 0.0 or rate_hz > 0.0:
+        step = 1.0 / rate_hz if rate_hz > 0.0 else log.step_s
+        even: FloatArray = np.arange(int((time[-1] - time[0]) / step + 1e-9) + 1) * np.float64(step)
+        # Smoothed at the log's own pace: fewer samples would alias what the smoothing is to remove.
+        fine_step = min(step, log.step_s)
+        fine = np.arange(int((time[-1] - time[0]) / fine_step + 1e-9) + 1) * fine_step
+        smoothed = _smoothed(np.interp(fine, time, speed), smooth_s / fine_step)
+        speed, grade = np.interp(even, fine, smoothed), np.interp(even, time, grade)
+        time = even
+    wrong = implausible(time, speed)
+    if wrong:
+        raise ConfigError(log.name, "", f"speed {wrong[1]}", "another unit, or --smooth against single wrong samples")
+    return make_cycle(log.name, time, speed, grade)
+
+
+def _without_gaps(time: FloatArray, speed: FloatArray, max_gap_s: float, step_s: float) -> FloatArray:
+    steps = np.diff(time)
+    joint = np.maximum(step_s, np.abs(np.diff(speed)) / JOINT_MPS2)
+    steps = np.where(steps > max_gap_s, np.minimum(joint, steps), steps)
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+def _smoothed(speed: FloatArray, width: float) -> FloatArray:
+    """A bell-shaped mean; where the car stands, it stands."""
+    if width <= 0.0:
+        return speed
+    reach = min(int(np.ceil(4.0 * width)), speed.size)
+    bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    padded = np.concatenate((np.full(reach, speed[0]), speed, np.full(reach, speed[-1])))
+    smooth = np.convolve(padded, bell / bell.sum(), mode="valid")
+    return np.where(speed > 0.0, smooth, 0.0)
+
+
+def cycle_text(cycle: Cycle, grade: bool) -> str:
+    """The cycle as its CSV."""
+    rows = [
+        f"{t:.10g},{v:.10g}" + (f",{g:.8g}" if grade else "")
+        for t, v, g in zip(cycle.time_s, cycle.speed_mps, cycle.grade, strict=True)
+    ]
+    return "\n".join(["time_s,speed_mps" + (",grade" if grade else ""), *rows]) + "\n"

@@ -1,0 +1,131 @@
+"""import_cycle: logs in any unit, with gaps and noise, become a cycle; what was guessed is said."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.share import share_path
+from iwm_power_manager.tools.import_cycle import main
+
+NYCC = load_cycle(share_path("config/cycles/nycc.csv"))
+
+
+def log_of(path, header, rows, separator=",", comma=False):
+    """A table; numbers with a decimal comma where asked."""
+    lines = [separator.join(header)]
+    lines += [separator.join(str(x).replace(".", ",") if comma else str(x) for x in row) for row in rows]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and stderr of the command."""
+    code = main([str(x) for x in arguments])
+    return code, *capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("header", "factors", "words"),
+    [
+        (("time_s", "v [km/h]"), (1.0, 3.6), "speed in km/h, as the column's name says"),
+        (("time", "speed"), (1.0, 3.6), "speed in km/h: guessed from the accelerations"),
+        (("Time [ms]", "Speed (mph)"), (1e3, 1 / 0.44704), "speed in mph, as the column's name says"),
+        (("stamp_ns", "velocity m/s"), (1e9, 1.0), "time in ns, as the column's name says"),
+        (("t", "speed"), (1e3, 1.0), "time in ms: guessed"),
+    ],
+)
+def test_units_are_named_or_guessed_and_the_same_cycle_comes_out(tmp_path, capsys, header, factors, words):
+    rows = zip(NYCC.time_s * factors[0], NYCC.speed_mps * factors[1], strict=True)
+    log = log_of(tmp_path / "log.csv", header, rows)
+    code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv")
+    assert code == 0
+    assert words in out
+    found = load_cycle(tmp_path / "trip.csv")
+    np.testing.assert_allclose(found.time_s, NYCC.time_s, atol=1e-6)
+    np.testing.assert_allclose(found.speed_mps, NYCC.speed_mps, atol=1e-6)
+
+
+def test_semicolons_decimal_commas_clocks_and_empty_cells_are_read(tmp_path, capsys):
+    rows = [(f"12:00:{t:02d},5", 3.6 * t, "x") for t in range(10)]
+    rows[4] = (rows[4][0], "", "x")
+    log = log_of(tmp_path / "log.csv", ("Zeit", "Geschwindigkeit km/h", "note"), rows, ";", comma=True)
+    code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv", "--json", tmp_path / "n.json")
+    assert code == 0
+    assert "decimal commas" in out
+    assert "1 rows without a value left out" in out
+    assert load_cycle(tmp_path / "trip.csv").speed_mps.tolist() == pytest.approx([0, 1, 2, 3, 5, 6, 7, 8, 9])
+    assert json.loads((tmp_path / "n.json").read_text())["speed_unit"] == "km/h"
+
+
+def test_a_gap_is_bridged_or_cut_by_choice_and_never_in_silence(tmp_path, capsys):
+    keep = (NYCC.time_s < 200) | (NYCC.time_s > 250)
+    log = log_of(
+        tmp_path / "log.csv", ("time_s", "speed m/s"), zip(NYCC.time_s[keep], NYCC.speed_mps[keep], strict=True)
+    )
+    output = tmp_path / "trip.csv"
+    code, _, err = run(capsys, log, "--output", output)
+    assert code == 2
+    assert "has 1 gaps, the longest of 52 s from 199 s; allowed: --gaps bridge, --gaps cut" in err
+    assert not output.exists()
+    code, out, _ = run(capsys, log, "--output", output, "--gaps", "bridge")
+    assert "gap of 52 s from 199 s bridged by a straight line" in out
+    assert load_cycle(output).duration_s == NYCC.duration_s
+    code, out, _ = run(capsys, log, "--output", output, "--gaps", "cut")
+    assert "cut out" in out
+    assert NYCC.duration_s - 52 < load_cycle(output).duration_s < NYCC.duration_s - 40
+
+
+def test_smoothing_takes_noise_away_and_says_what_it_does_to_the_energy(tmp_path, capsys):
+    trace = NYCC.resample(0.1)
+    noise = np.random.default_rng(2).normal(0.0, 0.1 / 3.6, trace.time_s.size)
+    rows = zip(trace.time_s, trace.speed_mps + noise, strict=True)
+    log = log_of(tmp_path / "log.csv", ("time_s", "speed m/s"), rows)
+    numbers = {}
+    for smooth in (0, 0.5):
+        options = ("--smooth", smooth, "--json", tmp_path / "n.json", "--plot", tmp_path / "trip.png")
+        code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv", *options)
+        assert code == 0
+        numbers[smooth] = json.loads((tmp_path / "n.json").read_text())
+    assert (tmp_path / "trip.png").read_bytes().startswith(b"\x89PNG")
+    assert numbers[0]["noise_mps"] == pytest.approx(0.1 / 3.6, rel=0.15)
+    assert "as logged (-" in out
+    clean = np.interp(load_cycle(tmp_path / "trip.csv").time_s, NYCC.time_s, NYCC.speed_mps)
+    assert np.std(load_cycle(tmp_path / "trip.csv").speed_mps - clean) < 0.5 * np.std(noise) + 0.05
+    assert numbers[0.5]["traction_wh_per_km"] < 0.97 * numbers[0]["traction_wh_per_km"]
+
+
+def test_a_trace_the_car_cannot_follow_is_warned_of(tmp_path, capsys):
+    log = log_of(tmp_path / "log.csv", ("time_s", "speed m/s"), [(t, min(6.0 * t, 60.0)) for t in range(30)])
+    code, _, err = run(capsys, log, "--output", tmp_path / "trip.csv", "--friction", 0.5)
+    assert code == 0
+    assert "jalalmaab_2015: log: asks" in err
+    assert "the motors give" in err
+    assert "the tyres carry at friction 0.5 3924 N" in err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "is empty"),
+        ("time,speed\n0,0\n", "has 1 usable rows"),
+        ("a,b\n0,0\n1,1\n", "has no column that looks like it: name it; allowed: a, b"),
+        ("time_s,speed m/s\n0,0\n1,fast\n", "line 3, speed m/s: 'fast' is no number"),
+        ("time_s,speed m/s\n0,0\n1,-9\n", "driving backwards is no cycle"),
+        ("time_s,speed m/s\n0,0\n1,60\n", "no car does"),
+        ("time,speed\n0,0\n1,1e9\n", "look like driving in no unit"),
+        ("time clock,speed m/s\n12:00:00,1\nlater,2\n", "'later' is no time"),
+        ("time_s,speed m/s\n0," + "1" * 5000 + "\n", "has 5002 characters"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line_and_nothing_is_written(tmp_path, capsys, text, words):
+    (tmp_path / "log.csv").write_text(text)
+    code, out, err = run(capsys, tmp_path / "log.csv", "--output", tmp_path / "trip.csv")
+    assert (code, out) == (2, "")
+    assert err.startswith("import_cycle: error: ")
+    assert err.count("\n") == 1
+    assert words in err
+    assert not (tmp_path / "trip.csv").exists()

@@ -1,0 +1,116 @@
+"""import_motor: tables in rpm, percent, matrix layout, with decimal commas and behind a gear become a map."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from iwm_power_manager.motor_map import read_map
+from iwm_power_manager.share import share_path
+from iwm_power_manager.tools.import_motor import main
+
+MAP = share_path("config/motors/siemens_pm_7500w.csv")
+WHOLE = read_map(MAP)
+RPM = 60.0 / (2.0 * math.pi)
+
+
+def efficiency(i, j):
+    power = WHOLE.speed_radps[i] * WHOLE.torque_nm[j]
+    return power / (power + WHOLE.loss_w[i, j])
+
+
+def points():
+    """Speed, torque and efficiency of the shipped map."""
+    for i, w in enumerate(WHOLE.speed_radps):
+        for j, t in enumerate(WHOLE.torque_nm):
+            yield float(w), float(t), float(efficiency(i, j))
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and stderr of the command."""
+    code = main([str(x) for x in arguments])
+    return code, *capsys.readouterr()
+
+
+def same(path, speed=1.0, torque=1.0):
+    """Whether a written map is the shipped one, its axes scaled."""
+    found = read_map(path)
+    np.testing.assert_allclose(found.speed_radps, WHOLE.speed_radps * speed, rtol=1e-6)
+    np.testing.assert_allclose(found.torque_nm, WHOLE.torque_nm * torque, rtol=1e-6)
+    np.testing.assert_allclose(found.loss_w, WHOLE.loss_w, rtol=1e-4)
+
+
+def test_a_list_in_rpm_and_percent(tmp_path, capsys):
+    table = tmp_path / "sheet.csv"
+    table.write_text("n/rpm,T/Nm,eta\n" + "".join(f"{w * RPM:.8f},{t},{100 * e:.8f}\n" for w, t, e in points()))
+    options = ("--plot", tmp_path / "map.png", "--json", tmp_path / "map.json")
+    code, out, err = run(capsys, table, "--output", tmp_path / "map.csv", *options)
+    assert (code, err) == (0, "")
+    assert "speeds in rpm, as the header says" in out
+    assert "efficiencies in percent: one is above 1.5" in out
+    assert "loss model: 46 + 0.69 w + 0.0151 w^2 + 2.03 |T| + 0.0685 T^2 W" in out
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((tmp_path / "map.json").read_text())["best_efficiency"]["speed_radps"] == pytest.approx(150.0)
+    same(tmp_path / "map.csv")
+
+
+@pytest.mark.parametrize("down", ["speed", "torque"])
+def test_a_matrix_with_decimal_commas_behind_a_gear(tmp_path, capsys, down):
+    speeds, torques = WHOLE.speed_radps * 9.0, WHOLE.torque_nm / 9.0
+    grid = np.array([[efficiency(i, j) for j in range(torques.size)] for i in range(speeds.size)])
+    side, top, cells = (speeds, torques, grid) if down == "speed" else (torques, speeds, grid.T)
+    lines = ["w\\\\T;" + ";".join(f"{x:.9f}" for x in top)]
+    lines += [f"{x:.9f};" + ";".join(f"{e:.9f}" for e in row) for x, row in zip(side, cells, strict=True)]
+    table = tmp_path / "sheet.csv"
+    table.write_text("\n".join(lines).replace(".", ",") + "\n")
+    options = ("--layout", "matrix", "--down", down, "--gear", 9, "--speed-unit", "rad/s")
+    code, out, _ = run(capsys, table, "--output", tmp_path / "map.csv", *options)
+    assert code == 0
+    assert "decimal commas" in out
+    same(tmp_path / "map.csv")
+
+
+def test_losses_become_efficiencies(tmp_path, capsys):
+    table = tmp_path / "sheet.tsv"
+    rows = [(w, t, w * t / e - w * t) for w, t, e in points()]
+    table.write_text("rad/s\tNm\tW\n" + "".join("\t".join(f"{x:.9f}" for x in row) + "\n" for row in rows))
+    assert run(capsys, table, "--output", tmp_path / "map.csv", "--quantity", "loss", "--quiet")[:2] == (0, "")
+    same(tmp_path / "map.csv")
+
+
+def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys):
+    demands = ("--peak-torque", 300, "--regeneration-torque", 80, "--max-power", 7500, "--top-speed", 200)
+    code, _, err = run(capsys, MAP, "--output", tmp_path / "map.csv", *demands)
+    assert code == 0
+    assert "it lacks speeds from 150 to the 200 rad/s" in err
+    assert "it lacks torques from 200 to the peak torque, 300 N m" in err
+    assert "it lacks torques from 0 to the regeneration torque" in err
+    assert "regeneration" not in run(capsys, MAP, "--output", tmp_path / "map.csv", *demands, "--mirror")[2]
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "words"),
+    [
+        ("", (), "is empty"),
+        ("w,t,eta\n1,2\n", ("--layout", "list"), "line 2: has 2 values; allowed: 3: speed, torque, value"),
+        ("w,t,eta\n1,x,0.5\n", (), "line 2, torque_nm: 'x' is no number"),
+        ("w,t,eta\n1,2,0.5\n1,2,0.6\n", (), "line 3: repeats speed 1, torque 2"),
+        ("w,t,eta\n1,2,300\n", (), "line 2: efficiency 3 is out of range"),
+        ("w,t,eta\n1,2,85\n2,3,0.5\n", ("--no-percent",), "line 2: efficiency 85 is out of range; allowed: 0 to 1, or"),
+        ("w,t,loss\n1,2,-3\n", ("--quantity", "loss"), "loss -3 W is out of range"),
+        ("w,t,eta\n-1,2,0.3\n", (), "speed_rad_s -1 is out of range"),
+        ("w,1,2\n1,0.5,0.5,0.5\n", ("--layout", "matrix"), "line 2: has 3 values; allowed: 2, as in line 1"),
+        ("w,t,eta\n1,2,nan\n2,3,nan\n", (), "has no point with speed and torque above zero"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line_and_nothing_is_written(tmp_path, capsys, text, options, words):
+    (tmp_path / "sheet.csv").write_text(text)
+    code, out, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "map.csv", *options)
+    assert (code, out) == (2, "")
+    assert err.startswith("import_motor: error: ")
+    assert err.count("\n") == 1
+    assert words in err
+    assert not (tmp_path / "map.csv").exists()
