@@ -18,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from iwm_power_manager import __version__
-from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.files import atomic_write, check_number
 from iwm_power_manager.mdp.certify import bellman_bound
@@ -33,6 +33,7 @@ from iwm_power_manager.mdp.demand_counts import transitions_source
 from iwm_power_manager.mdp.policy_iteration import Iteration
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.mdp.transitions import build_model
+from iwm_power_manager.model.feasible import trace_warnings
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.demand import drive_source, read_drives
@@ -152,7 +153,10 @@ def _solve(options: argparse.Namespace) -> int:
     paths = targets(Path(options.output), vehicle, problem, frictions)
     say = _silent if options.quiet else print
 
-    sources = _sources(options, problem, vehicle)
+    cycles = [load_cycle(resolve(path)) for path in options.cycle]
+    for line in (*(f"note: {note}" for note in vehicle.notes), *_doubts(cycles, vehicle, frictions)):
+        print(f"solve_policy: {line}", file=sys.stderr)
+    sources = _sources(options, cycles, problem, vehicle)
     chain = chain_of(problem, sources)
     say(_problem_text(problem, vehicle))
     say(_demand_text(chain, sources, problem.dt_s))
@@ -190,8 +194,14 @@ def _problem(options: argparse.Namespace) -> Problem:
     return dataclasses.replace(problem, discount=discount)
 
 
-def _sources(options: argparse.Namespace, problem: Problem, vehicle: Vehicle) -> list[Source]:
-    sources = [source_of(load_cycle(resolve(path)), problem, vehicle.params) for path in options.cycle]
+def _doubts(cycles: Sequence[Cycle], vehicle: Vehicle, frictions: Sequence[float]) -> list[str]:
+    """What of the cycles this car cannot follow, each once."""
+    found = (w for f in frictions for cycle in cycles for w in trace_warnings(cycle, vehicle.params, f))
+    return [f"warning: {vehicle.name}: {words}" for words in dict.fromkeys(found)]
+
+
+def _sources(options: argparse.Namespace, cycles: Sequence[Cycle], problem: Problem, vehicle: Vehicle) -> list[Source]:
+    sources = [source_of(cycle, problem, vehicle.params) for cycle in cycles]
     drives = read_drives(options.bag, options.mapping, vehicle, "solve_policy")
     sources += [drive_source(name, drive, problem, options.bag_weight) for name, drive in drives]
     return sources + [transitions_source(path, problem.dt_s, options.bag_weight) for path in options.transitions]

@@ -16,6 +16,7 @@ from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
+from iwm_power_manager.model.feasible import trace_warnings
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.road_report import text as road_text
 from iwm_sim.road_run import check_scenario
@@ -45,6 +46,8 @@ def _evaluate(options: argparse.Namespace) -> None:
     started = time.perf_counter()
     say = silent if options.quiet else tell
     wanted = planned(options, say)
+    for line in _doubts(wanted):
+        say(f"evaluate: {line}")
     with Progress(len(wanted), options.quiet) as progress:
         warm_up(wanted, say)
         wanted = with_rules(wanted, options.jobs)
@@ -60,6 +63,16 @@ def _evaluate(options: argparse.Namespace) -> None:
         content = {"package_version": __version__, "rows": [row.to_json() for row in rows]}
         atomic_write(options.json, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
         say(f"rows: {options.json}")
+
+
+def _doubts(wanted: Sequence[Case]) -> list[str]:
+    """What a reader should know of the cars and cycles before they are driven, each once."""
+    lines: list[str] = []
+    for case in wanted:
+        vehicle, cycle = cases.vehicle_of(case.vehicle, case.idle_drive, case.car), cases.cycle_of(case.cycle)
+        lines += [f"note: {note}" for note in vehicle.notes]
+        lines += [f"warning: {vehicle.name}: {w}" for w in trace_warnings(cycle, vehicle.params, case.friction)]
+    return list(dict.fromkeys(lines))
 
 
 def planned(options: argparse.Namespace, say: Callable[[str], None]) -> list[Case]:
