@@ -150,8 +150,8 @@ def wheel_after(
     dt_s: float,
     wheel: Wheel,
     tyre: Tyre,
-) -> tuple[float, float]:
-    """Speed of one wheel after a step, and the torque that brake and drag exerted on it in the direction of its axle.
+) -> float:
+    """Speed of one wheel after a step, rad/s.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ def wheel_after(
     rate = wheel.inertia_kgm2 / dt_s
     locked, _ = _residual(0.0, before, torque, along, across, normal, friction, rate, wheel, tyre)
     if abs(locked) <= resisting:
-        return 0.0, locked
+        return 0.0
     # What the brake cannot hold turns: forwards if torque is left over at rest, backwards if it is missing.
     holding = -resisting if locked < 0.0 else resisting
     driving = torque + holding
@@ -191,7 +191,7 @@ def wheel_after(
         speed = after
         if abs(change) <= 1e-11 * (1.0 + abs(speed)):
             break
-    return speed, holding
+    return speed
 
 
 @kernel
@@ -258,16 +258,42 @@ def _add_stiffness(matrix, x, y, cosine, sine, reduced, k_xx, k_xy, k_yy):
     matrix[2, 2] += x * x * b_yy - 2.0 * x * y * b_xy + y * y * b_xx
 
 
+class _Surface(NamedTuple):
+    """What a step is taken with: torques at the wheels, steering, friction, and where each wheel stands."""
+
+    motor_nm: Four
+    resisting_nm: Four
+    cosine: Four
+    sine: Four
+    x_m: Four
+    y_m: Four
+    friction: Four
+
+
+@kernel
+def _surface(motors: Four, resisting: Four, steer_rad: float, friction: Four, vehicle: VehicleParams) -> _Surface:
+    x, y = wheel_places_m(vehicle)
+    c = math.cos(steer_rad)
+    s = math.sin(steer_rad)
+    return _Surface(motors, resisting, (c, c, 1.0, 1.0), (s, s, 0.0, 0.0), x, y, friction)
+
+
+@kernel
+def _over_ground(i: int, v_x: float, v_y: float, rate: float, on: _Surface) -> tuple[float, float]:
+    """Velocity of a wheel's contact point along and across the wheel."""
+    ground_x = v_x - rate * on.y_m[i]
+    ground_y = v_y + rate * on.x_m[i]
+    return on.cosine[i] * ground_x + on.sine[i] * ground_y, on.cosine[i] * ground_y - on.sine[i] * ground_x
+
+
 @kernel
 def _holds(
     speed_mps: float,
     lateral_mps: float,
     yaw_rate_radps: float,
     wheels: Four,
-    motors: Four,
-    resisting: Four,
+    on: _Surface,
     pull_n: float,
-    friction: Four,
     load: Four,
     vehicle: VehicleParams,
 ) -> bool:
@@ -284,11 +310,11 @@ def _holds(
     for i in range(4):
         axle = _axle(i, vehicle)
         radius = axle.wheel.radius_m
-        grip = friction[i] * peak_ratio(axle.tyre) * load[i]
-        if radius * abs(wheels[i]) > REST_MPS or abs(motors[i]) > resisting[i] + radius * grip:
+        grip = on.friction[i] * peak_ratio(axle.tyre) * load[i]
+        if radius * abs(wheels[i]) > REST_MPS or abs(on.motor_nm[i]) > on.resisting_nm[i] + radius * grip:
             return False
-        driving += motors[i] / radius
-        capacity += min(grip, resisting[i] / radius)
+        driving += on.motor_nm[i] / radius
+        capacity += min(grip, on.resisting_nm[i] / radius)
     return abs(driving) <= capacity
 
 
@@ -298,10 +324,8 @@ def _at_rest(
     lateral_mps: float,
     yaw_rate_radps: float,
     wheels: Four,
-    motors: Four,
-    resisting: Four,
+    on: _Surface,
     pull_n: float,
-    friction: Four,
     load: Four,
     dt_s: float,
     vehicle: VehicleParams,
@@ -315,16 +339,16 @@ def _at_rest(
     held = np.zeros(4)
     for i in range(4):
         axle = _axle(i, vehicle)
-        held[i] = min(friction[i] * peak_ratio(axle.tyre) * load[i], resisting[i] / axle.wheel.radius_m)
+        held[i] = min(on.friction[i] * peak_ratio(axle.tyre) * load[i], on.resisting_nm[i] / axle.wheel.radius_m)
         whole += held[i]
-        left -= motors[i] / axle.wheel.radius_m
+        left -= on.motor_nm[i] / axle.wheel.radius_m
     work = -0.5 * braked * speed_mps
     work += 0.5 * (mass * lateral_mps * lateral_mps + chassis.yaw_inertia_kgm2 * yaw_rate_radps**2) / dt_s
     for i in range(4):
         wheel = _axle(i, vehicle).wheel
         share = held[i] / whole if whole > 0.0 else 0.25
-        force = motors[i] / wheel.radius_m + share * left
-        held[i] = wheel.radius_m * force - motors[i] - wheel.inertia_kgm2 * wheels[i] / dt_s
+        force = on.motor_nm[i] / wheel.radius_m + share * left
+        held[i] = wheel.radius_m * force - on.motor_nm[i] - wheel.inertia_kgm2 * wheels[i] / dt_s
         work += 0.5 * force * wheel.radius_m * wheels[i]
     return PlaneMotion(
         speed_mps=0.0,
@@ -342,6 +366,85 @@ def _at_rest(
         air_force_n=0.0,
         slip_work_w=work,
     )
+
+
+@kernel
+def _tyres(before: Four, v_x, v_y, rate, load: Four, on: _Surface, dt_s, vehicle, wheels, force, matrix):
+    """Solve each wheel at a motion of the car; its force and its stiffness on the car.
+
+    Parameters
+    ----------
+    before : wheel speeds before the step
+    wheels, force : float64[4], float64[4, 2], output: speeds after the step, forces along and across the wheels
+    matrix : float64[3, 3], in and output: the tyres' stiffnesses are added
+
+    Returns
+    -------
+    sum of the forces forward and to the left (N), their moment (N m)
+    """
+    total_x = 0.0
+    total_y = 0.0
+    moment = 0.0
+    for i in range(4):
+        axle = _axle(i, vehicle)
+        radius = axle.wheel.radius_m
+        c = on.cosine[i]
+        s = on.sine[i]
+        along, across = _over_ground(i, v_x, v_y, rate, on)
+        wheels[i] = wheel_after(
+            before[i],
+            on.motor_nm[i],
+            on.resisting_nm[i],
+            along,
+            across,
+            load[i],
+            on.friction[i],
+            dt_s,
+            axle.wheel,
+            axle.tyre,
+        )
+        f_x, f_y, k_xx, k_xy, k_yy, _ = tyre_force_n(
+            radius * wheels[i], along, across, load[i], on.friction[i], axle.tyre
+        )
+        force[i, 0] = f_x
+        force[i, 1] = f_y
+        body_x = c * f_x - s * f_y
+        body_y = s * f_x + c * f_y
+        total_x += body_x
+        total_y += body_y
+        moment += on.x_m[i] * body_y - on.y_m[i] * body_x
+        # Beyond the peak the force falls with slip: as a stiffness that would lead the iteration astray.
+        k_xx = max(k_xx, 0.0)
+        k_yy = max(k_yy, 0.0)
+        most = math.sqrt(k_xx * k_yy)
+        k_xy = min(max(k_xy, -most), most)
+        reduced = 1.0
+        if wheels[i] != 0.0:
+            # A wheel that turns gives way: its inertia and the tyre's stiffness in series.
+            turning = axle.wheel.inertia_kgm2 / (dt_s * radius * radius)
+            reduced = turning / (turning + k_xx)
+            k_yy -= k_xy * k_xy / (turning + k_xx)
+        _add_stiffness(matrix, on.x_m[i], on.y_m[i], c, s, reduced, k_xx, k_xy, k_yy)
+    return total_x, total_y, moment
+
+
+@kernel
+def _slip_work_w(before: Four, mean_x, mean_y, mean_rate, on: _Surface, vehicle, wheels, force):
+    """Power that the tyres turned into heat: forces times the mean sliding before and after."""
+    work = 0.0
+    for i in range(4):
+        along, across = _over_ground(i, mean_x, mean_y, mean_rate, on)
+        rim = _axle(i, vehicle).wheel.radius_m * 0.5 * (before[i] + wheels[i])
+        work += force[i, 0] * (rim - along) - force[i, 1] * across
+    return work
+
+
+@kernel
+def _held_nm(i: int, before: Four, on: _Surface, dt_s, vehicle, wheels, force):
+    """What brake and drag exerted on a wheel: with this torque eq. 11 holds exactly, whatever the iteration left."""
+    wheel = _axle(i, vehicle).wheel
+    turning = wheel.inertia_kgm2 * (wheels[i] - before[i]) / dt_s
+    return turning + wheel.radius_m * force[i, 0] - on.motor_nm[i]
 
 
 @kernel
@@ -375,151 +478,91 @@ def step(
     friction : peak friction coefficient under each wheel
     dt_s : step, > 0
     """
-    chassis = vehicle.chassis
-    mass = chassis.mass_kg
-    inertia = chassis.yaw_inertia_kgm2
-    slope_force = grade_force_n(grade, chassis)
     load = loads_n(acceleration_mps2, lateral_acceleration_mps2, speed_mps + headwind_mps, grade, vehicle)
-    wind = math.copysign(aerodynamic_force_n(headwind_mps, chassis), headwind_mps)
-    if _holds(
+    on = _surface(motor_torque_nm, resisting_torque_nm, steer_rad, friction, vehicle)
+    slope = grade_force_n(grade, vehicle.chassis)
+    # At rest the wind is held like the slope; its work is nothing.
+    pull = slope + math.copysign(aerodynamic_force_n(headwind_mps, vehicle.chassis), headwind_mps)
+    before = wheel_speed_radps
+    if _holds(speed_mps, lateral_mps, yaw_rate_radps, before, on, pull, load, vehicle):
+        return _at_rest(speed_mps, lateral_mps, yaw_rate_radps, before, on, slope, load, dt_s, vehicle)
+    return _moving(
         speed_mps,
         lateral_mps,
         yaw_rate_radps,
-        wheel_speed_radps,
-        motor_torque_nm,
-        resisting_torque_nm,
-        slope_force + wind,
-        friction,
-        load,
+        before,
+        acceleration_mps2,
+        lateral_acceleration_mps2,
+        on,
+        grade,
+        headwind_mps,
+        dt_s,
         vehicle,
-    ):
-        # At rest the wind is held like the slope; its work is nothing.
-        return _at_rest(
-            speed_mps,
-            lateral_mps,
-            yaw_rate_radps,
-            wheel_speed_radps,
-            motor_torque_nm,
-            resisting_torque_nm,
-            slope_force,
-            friction,
-            load,
-            dt_s,
-            vehicle,
-        )
+    )
 
+
+@kernel
+def _moving(
+    speed_mps: float,
+    lateral_mps: float,
+    yaw_rate_radps: float,
+    before: Four,
+    acceleration_mps2: float,
+    lateral_acceleration_mps2: float,
+    on: _Surface,
+    grade: float,
+    headwind_mps: float,
+    dt_s: float,
+    vehicle: VehicleParams,
+) -> PlaneMotion:
+    """The step of a car that nothing holds: Newton's method on its motion at the end of the step."""
+    chassis = vehicle.chassis
+    mass_rate = chassis.mass_kg / dt_s
+    yaw_inertia_rate = chassis.yaw_inertia_kgm2 / dt_s
+    slope = grade_force_n(grade, chassis)
+    drop = rolling_force_n(grade, chassis) / mass_rate
     turned = yaw_rate_radps * dt_s
     # The same velocity over ground, in the axes of the body as it points after the step.
     start_x = math.cos(turned) * speed_mps + math.sin(turned) * lateral_mps
     start_y = -math.sin(turned) * speed_mps + math.cos(turned) * lateral_mps
-    places_x, places_y = wheel_places_m(vehicle)
-    cosine = math.cos(steer_rad)
-    sine = math.sin(steer_rad)
-    most_rolling = rolling_force_n(grade, chassis)
-
     v_x = start_x + acceleration_mps2 * dt_s
     v_y = start_y + lateral_acceleration_mps2 * dt_s
     rate = yaw_rate_radps
     wheels = np.zeros(4)
-    holding = np.zeros(4)
-    force_x = np.zeros(4)  # of each tyre along and across its wheel
-    force_y = np.zeros(4)
+    force = np.zeros((4, 2))
     matrix = np.zeros((3, 3))
     change = np.zeros(3)
-    after_x, after_y, after_rate = v_x, v_y, rate
-    rolling = 0.0
-    air = 0.0
+    load = (0.0, 0.0, 0.0, 0.0)
+    after_x, after_y, after_rate, coasting, air = v_x, v_y, rate, v_x, 0.0
     last = math.inf
     damping = 1.0
     for _ in range(_MOST_ITERATIONS):
         load = loads_n((v_x - start_x) / dt_s, (v_y - start_y) / dt_s, v_x + headwind_mps, grade, vehicle)
         matrix[:] = 0.0
-        matrix[0, 0] = mass / dt_s
-        matrix[1, 1] = mass / dt_s
-        matrix[2, 2] = inertia / dt_s
-        total_x = 0.0
-        total_y = 0.0
-        moment = 0.0
-        for i in range(4):
-            axle = _axle(i, vehicle)
-            radius = axle.wheel.radius_m
-            c = cosine if i < 2 else 1.0
-            s = sine if i < 2 else 0.0
-            ground_x = v_x - rate * places_y[i]
-            ground_y = v_y + rate * places_x[i]
-            along = c * ground_x + s * ground_y
-            across = -s * ground_x + c * ground_y
-            wheels[i], holding[i] = wheel_after(
-                wheel_speed_radps[i],
-                motor_torque_nm[i],
-                resisting_torque_nm[i],
-                along,
-                across,
-                load[i],
-                friction[i],
-                dt_s,
-                axle.wheel,
-                axle.tyre,
-            )
-            f_x, f_y, k_xx, k_xy, k_yy, _ = tyre_force_n(
-                radius * wheels[i], along, across, load[i], friction[i], axle.tyre
-            )
-            force_x[i] = f_x
-            force_y[i] = f_y
-            body_x = c * f_x - s * f_y
-            body_y = s * f_x + c * f_y
-            total_x += body_x
-            total_y += body_y
-            moment += places_x[i] * body_y - places_y[i] * body_x
-            # Beyond the peak the force falls with slip: as a stiffness that would lead the iteration astray.
-            k_xx = max(k_xx, 0.0)
-            k_yy = max(k_yy, 0.0)
-            k_xy = min(max(k_xy, -math.sqrt(k_xx * k_yy)), math.sqrt(k_xx * k_yy))
-            reduced = 1.0
-            if wheels[i] != 0.0:
-                # A wheel that turns gives way: its inertia and the tyre's stiffness in series.
-                turning = axle.wheel.inertia_kgm2 / (dt_s * radius * radius)
-                reduced = turning / (turning + k_xx)
-                k_yy -= k_xy * k_xy / (turning + k_xx)
-            _add_stiffness(matrix, places_x[i], places_y[i], c, s, reduced, k_xx, k_xy, k_yy)
-        air_speed = v_x + headwind_mps
-        air = math.copysign(aerodynamic_force_n(air_speed, chassis), air_speed)
-        coasting = start_x + dt_s / mass * (total_x - air - slope_force)
-        after_x = coasting - min(max(coasting, -most_rolling * dt_s / mass), most_rolling * dt_s / mass)
-        rolling = (coasting - after_x) * mass / dt_s
-        after_y = start_y + dt_s / mass * total_y
-        after_rate = yaw_rate_radps + dt_s / inertia * moment
-        change[0] = (after_x - v_x) * mass / dt_s
-        change[1] = (after_y - v_y) * mass / dt_s
-        change[2] = (after_rate - rate) * inertia / dt_s
+        matrix[0, 0] = mass_rate
+        matrix[1, 1] = mass_rate
+        matrix[2, 2] = yaw_inertia_rate
+        total_x, total_y, moment = _tyres(before, v_x, v_y, rate, load, on, dt_s, vehicle, wheels, force, matrix)
+        air = math.copysign(aerodynamic_force_n(v_x + headwind_mps, chassis), v_x + headwind_mps)
+        coasting = start_x + (total_x - air - slope) / mass_rate
+        after_x = coasting - min(max(coasting, -drop), drop)
+        after_y = start_y + total_y / mass_rate
+        after_rate = yaw_rate_radps + moment / yaw_inertia_rate
         off = max(abs(after_x - v_x), abs(after_y - v_y), abs(after_rate - rate))
         if off <= _TOLERANCE * (1.0 + abs(after_x)):
             break
         damping = max(0.5 * damping, 0.05) if off > last else min(1.2 * damping, 1.0)
         last = off
+        change[0] = (after_x - v_x) * mass_rate
+        change[1] = (after_y - v_y) * mass_rate
+        change[2] = (after_rate - rate) * yaw_inertia_rate
         _solve3(matrix, change)
         v_x += damping * change[0]
         v_y += damping * change[1]
         rate += damping * change[2]
-
     mean_x = 0.5 * (start_x + after_x)
     mean_y = 0.5 * (start_y + after_y)
     mean_rate = 0.5 * (yaw_rate_radps + after_rate)
-    work = 0.0
-    for i in range(4):
-        c = cosine if i < 2 else 1.0
-        s = sine if i < 2 else 0.0
-        ground_x = mean_x - mean_rate * places_y[i]
-        ground_y = mean_y + mean_rate * places_x[i]
-        rim = _axle(i, vehicle).wheel.radius_m * 0.5 * (wheel_speed_radps[i] + wheels[i])
-        work += force_x[i] * (rim - c * ground_x - s * ground_y) - force_y[i] * (c * ground_y - s * ground_x)
-        # Whatever the iteration left over is the brake's or nobody's: eq. 11 holds exactly with this torque.
-        wheel = _axle(i, vehicle).wheel
-        holding[i] = (
-            wheel.inertia_kgm2 * (wheels[i] - wheel_speed_radps[i]) / dt_s
-            + wheel.radius_m * force_x[i]
-            - motor_torque_nm[i]
-        )
     return PlaneMotion(
         speed_mps=after_x,
         lateral_speed_mps=after_y,
@@ -528,11 +571,16 @@ def step(
         acceleration_mps2=(after_x - start_x) / dt_s,
         lateral_acceleration_mps2=(after_y - start_y) / dt_s,
         normal_force_n=load,
-        holding_torque_nm=(holding[0], holding[1], holding[2], holding[3]),
+        holding_torque_nm=(
+            _held_nm(0, before, on, dt_s, vehicle, wheels, force),
+            _held_nm(1, before, on, dt_s, vehicle, wheels, force),
+            _held_nm(2, before, on, dt_s, vehicle, wheels, force),
+            _held_nm(3, before, on, dt_s, vehicle, wheels, force),
+        ),
         turned_rad=turned,
         mean_speed_mps=mean_x,
         mean_lateral_mps=mean_y,
-        rolling_force_n=rolling,
+        rolling_force_n=(coasting - after_x) * mass_rate,
         air_force_n=air,
-        slip_work_w=work,
+        slip_work_w=_slip_work_w(before, mean_x, mean_y, mean_rate, on, vehicle, wheels, force),
     )
