@@ -10,15 +10,13 @@ from __future__ import annotations
 
 import errno
 import os
-import sys
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, cast
 
 from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
-
-from iwm_power_manager.bags.mcap_records import MESSAGE_OVERHEAD_BYTES
 
 COMPRESSIONS = ("none", "lz4", "zstd")
 
@@ -50,7 +48,7 @@ class McapFile:
     path : file to create; it must not exist
     library : who wrote it, for the header
     compression : "none", "lz4" or "zstd"
-    chunk_bytes : uncompressed size at which a chunk is closed
+    chunk_bytes : uncompressed size beyond which a chunk is closed
     profile : whose conventions the file follows
 
     Attributes
@@ -58,7 +56,7 @@ class McapFile:
     size_bytes : what is in the file so far
     message_count, channel_counts, start_time_ns, end_time_ns : of the messages in closed chunks; times are 0 while
         there are none
-    pending_bytes, pending_count : messages that are in memory only
+    pending_count : messages that are in memory only
     broken : a write has failed
 
     Raises
@@ -83,19 +81,16 @@ class McapFile:
         self.start_time_ns = 0
         self.end_time_ns = 0
         self.channel_counts: dict[int, int] = {}
-        self.pending_bytes = 0
-        self.pending_count = 0
-        self._pending: dict[int, int] = {}
-        self._pending_span = (0, 0)
-        self._chunk_bytes = chunk_bytes
+        self._pending: list[tuple[int, int]] = []  # channel and log time
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self.broken = False
         self._buffer = _Buffer()
-        # Chunks are closed here, by size and by time.
+        self._pieces = self._buffer.pieces
+        # Chunks are closed by the writer when they are large enough, and here by time.
         self._writer = Writer(
-            cast("IO[bytes]", self._buffer), chunk_size=sys.maxsize, compression=CompressionType[compression.upper()]
+            cast("IO[bytes]", self._buffer), chunk_size=chunk_bytes, compression=CompressionType[compression.upper()]
         )
-        self._add = self._writer.add_message
+        self._add: Callable[..., None] = self._writer.add_message
         self._stream: IO[bytes] = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by finish() or abandon()
         self._writer.start(profile, library)
         try:
@@ -104,17 +99,26 @@ class McapFile:
             self.remove()
             raise
 
+    @property
+    def pending_count(self) -> int:
+        """Messages that are in memory only."""
+        return len(self._pending)
+
     def schema_id(self, name: str, encoding: str, data: bytes) -> int:
         """Id of a schema, the same for the same schema."""
         key = (name, encoding, data)
         if key not in self._schema_ids:
             self._schema_ids[key] = self._writer.register_schema(name, encoding, data)
+            if self._pieces:
+                self._take_up()
         return self._schema_ids[key]
 
     def add_channel(self, topic: str, schema_id: int, metadata: Mapping[str, str], encoding: str = "cdr") -> int:
         """Announce a channel; returns its id. It is in the file with the first chunk that follows."""
         channel = self._writer.register_channel(topic, encoding, schema_id, dict(metadata))
         self.channel_counts[channel] = 0
+        if self._pieces:  # that has closed a chunk
+            self._take_up()
         return channel
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
@@ -139,39 +143,31 @@ class McapFile:
 
     def write(self, channel: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes) -> None:
         """Add a message to the chunk in memory; all numbers >= 0."""
-        self._check()
         self._add(channel, log_time_ns, data, publish_time_ns, sequence)
-        pending = self._pending
-        pending[channel] = pending.get(channel, 0) + 1
-        if self.pending_count:
-            start, end = self._pending_span
-            if log_time_ns < start:
-                self._pending_span = (log_time_ns, end)
-            elif log_time_ns > end:
-                self._pending_span = (start, log_time_ns)
-        else:
-            self._pending_span = (log_time_ns, log_time_ns)
-        self.pending_count += 1
-        self.pending_bytes += MESSAGE_OVERHEAD_BYTES + len(data)
-        if self.pending_bytes >= self._chunk_bytes:
-            self.flush()
+        self._pending.append((channel, log_time_ns))
+        if self._pieces:  # the writer has closed a chunk
+            self._take_up()
 
     def flush(self, sync: bool = False) -> None:
         """Write the chunk in memory, if it holds a message; with `sync` wait until the disk has it."""
         if self._pending:
-            pending, span = self._pending, self._pending_span
-            self._pending, self.pending_count, self.pending_bytes = {}, 0, 0
             self._writer.flush()
-            self._push()
-            for channel, count in pending.items():
-                self.channel_counts[channel] += count
-            self.start_time_ns = min(self.start_time_ns, span[0]) if self.message_count else span[0]
-            self.end_time_ns = max(self.end_time_ns, span[1])
-            self.message_count += sum(pending.values())
-            if os.fstat(self._stream.fileno()).st_nlink == 0:
-                raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
+            self._take_up()
         if sync:
             os.fdatasync(self._stream.fileno())
+
+    def _take_up(self) -> None:
+        """Bring a closed chunk into the file, and count its messages."""
+        pending, self._pending = self._pending, []
+        self._push()
+        start_ns, end_ns = min(time for _, time in pending), max(time for _, time in pending)
+        self.start_time_ns = min(self.start_time_ns, start_ns) if self.message_count else start_ns
+        self.end_time_ns = max(self.end_time_ns, end_ns)
+        self.message_count += len(pending)
+        for channel, count in Counter(channel for channel, _ in pending).items():
+            self.channel_counts[channel] += count
+        if os.fstat(self._stream.fileno()).st_nlink == 0:
+            raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
 
     def duplicate_descriptor(self) -> int:
         """A descriptor of the open file that stays valid when this one is closed."""
@@ -197,7 +193,7 @@ class McapFile:
         self._stream.close()
         self.path.unlink(missing_ok=True)
 
-    def _check(self) -> None:
+    def _check(self, *_: object) -> None:
         if self.broken:
             raise OSError(errno.EIO, "an earlier write has failed")
 
@@ -209,6 +205,7 @@ class McapFile:
             self._append(data)
         except OSError:
             self.broken = True
+            self._add = self._check
             raise
 
     def _append(self, data: bytes) -> None:

@@ -15,6 +15,7 @@ from typing import Self
 
 from iwm_power_manager import __version__
 from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
+from iwm_power_manager.bags.mcap_records import MESSAGE_OVERHEAD_BYTES
 from iwm_power_manager.bags.metadata import (
     CUSTOM_METADATA,
     METADATA_FILE,
@@ -90,6 +91,10 @@ class BagWriter:
         self._counts: list[int] = []
         self._channels: list[int] = []
         self._spans: list[FileSpan] = []
+        self._largest = self.options.max_message_bytes
+        self._splits = self.options.max_bytes > 0 or self.options.max_duration_ns > 0
+        self._pending_bytes = 0  # in memory, since the file had
+        self._pending_of = 0  # so many bytes
         self._file_start_ns = 0
         self._file_has_message = False
         self._closed = False
@@ -160,33 +165,35 @@ class BagWriter:
         publish_time_ns : when it was sent; None for the log time
         sequence : the publisher's counter, 0 if unknown
         """
-        options = self.options
-        if len(data) > options.max_message_bytes:
+        if len(data) > self._largest:
             raise MessageTooLarge(
                 f"{self.path}: {self._topics[topic].name}: a message of {len(data)} bytes was not written; "
-                f"allowed: <= {options.max_message_bytes}"
+                f"allowed: <= {self._largest}"
             )
-        file = self._open
+        if self._splits or not self._file_has_message:
+            self._split_if_due(log_time_ns, len(data))
+        if publish_time_ns is None:
+            publish_time_ns = log_time_ns
+        file = self._file or self._open
+        try:
+            file.write(self._channels[topic], log_time_ns, publish_time_ns, sequence & 0xFFFFFFFF, data)
+        except OSError as error:
+            raise self._failed(error) from None
+
+    def _split_if_due(self, log_time_ns: int, size: int) -> None:
+        """Begin the next file, if the present one is full or old enough."""
+        options, file = self.options, self._open
+        if self._file_has_message and (
+            0 < options.max_duration_ns <= log_time_ns - self._file_start_ns
+            or 0 < options.max_bytes < file.size_bytes + self._pending_bytes + size
+        ):
+            self.split()
+        if self._pending_of != file.size_bytes:  # a chunk has gone into the file
+            self._pending_of, self._pending_bytes = file.size_bytes, 0
+        self._pending_bytes += MESSAGE_OVERHEAD_BYTES + size
         if not self._file_has_message:
             self._file_start_ns = log_time_ns
             self._file_has_message = True
-        elif (options.max_duration_ns and log_time_ns - self._file_start_ns >= options.max_duration_ns) or (
-            options.max_bytes and file.size_bytes + file.pending_bytes + len(data) > options.max_bytes
-        ):
-            self.split()
-            file = self._open
-            self._file_start_ns = log_time_ns
-            self._file_has_message = True
-        try:
-            file.write(
-                self._channels[topic],
-                log_time_ns,
-                log_time_ns if publish_time_ns is None else publish_time_ns,
-                sequence & 0xFFFFFFFF,
-                data,
-            )
-        except OSError as error:
-            raise self._failed(error) from None
 
     def flush(self, sync: bool = False) -> None:
         """Bring everything given so far into the file; with `sync` onto the disk."""
