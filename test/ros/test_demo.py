@@ -242,3 +242,19 @@ def test_a_node_that_dies_ends_the_demo_with_its_name(in_the_middle) -> None:
     assert process.returncode == 1
     assert "demo: the power manager was killed by SIGKILL" in error
     assert not any(alive(node) for node in nodes)
+
+
+def test_a_scenario_is_driven_over_dds_and_held_against_what_it_requires(tmp_path: Path) -> None:
+    scenario = tmp_path / "short_stop.yaml"
+    scenario.write_text(
+        "format: 1\nabout: A short stop.\nstart: {speed_mps: 5.0}\ndemand: [{from_s: 0.1, brake: 0.5}]\n"
+        "road: {friction: 0.9}\nuntil: {time_s: 4.0, standstill: true}\n"
+        "require: {stopping_distance_m: {at_most: 20.0}}\n"
+    )
+    values = tmp_path / "values.json"
+    arguments = ("--scenario", scenario, "--strategy", "equal", "--output", tmp_path / "run", "--json", values)
+    done = subprocess.run(demo(*arguments), capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "pass  short_stop: A short stop." in done.stdout
+    assert "all that were published" in done.stdout
+    assert 1.0 < json.loads(values.read_text())["stopping_distance_m"] < 20.0
