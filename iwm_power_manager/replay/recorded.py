@@ -22,7 +22,15 @@ from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.signals.mapping import DEMANDS, PEDALS, SignalMapping, load_mapping, topic_named
-from iwm_power_manager.signals.readings import Assembly, DemandReading, Reading, TopicReader, topic_readers
+from iwm_power_manager.signals.readings import (
+    Assembly,
+    DemandReading,
+    MotionReading,
+    Reading,
+    TopicReader,
+    TorqueReading,
+    topic_readers,
+)
 from iwm_power_manager.signals.types import Types, types_of
 
 #: Messages from a bag's start that show whether its stamps advance, and how many may have the same one.
@@ -170,7 +178,8 @@ class SignalStream:
                 self.bad[topic] += 1
                 return []
             if isinstance(reading, JointReading) and not all(map(math.isfinite, reading.values)):
-                missing = [name for name, value in zip(WHEEL_NAMES, reading.values, strict=True) if math.isnan(value)]
+                found = zip(reading.names, reading.values, strict=False)  # in the order of the message
+                missing = [name for name, value in found if not math.isfinite(value)]
                 self.without[f"{topic}: {', '.join(missing)}"] += 1
         stamped = reader.stamped
         if stamped and not self._by_stamp:
@@ -195,6 +204,8 @@ def _usable(reading: Reading) -> bool:
     """Whether what has to be a number is one: of four wheels one, of a battery its state of charge."""
     if isinstance(reading, JointReading):
         return any(map(math.isfinite, reading.values))
+    if isinstance(reading, TorqueReading | MotionReading):
+        return True  # nobody needs them
     return math.isfinite(reading.soc if isinstance(reading, BatteryReading) else reading[-1])
 
 

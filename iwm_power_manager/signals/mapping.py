@@ -59,6 +59,8 @@ UNITS: dict[str, dict[str, Unit]] = {
     "acceleration_demand": _ACCELERATION,
     "accelerator_pedal": _RATIO,
     "brake_pedal": _RATIO,
+    "direction": {"1": Unit()},
+    "motor_torque": {"N m": Unit()},
     "soc": _RATIO,
     "battery_temperature": {"degC": Unit(), "K": Unit(1.0, -273.15), "degF": Unit(5.0 / 9.0, -160.0 / 9.0)},
     "battery_voltage": {"V": Unit()},
@@ -70,6 +72,8 @@ UNITS: dict[str, dict[str, Unit]] = {
     "steering_angle": {"rad": Unit(), "deg": Unit(math.pi / 180.0)},
 }
 SIGNALS = tuple(UNITS)
+#: Signals that are four numbers, one for each wheel.
+OF_WHEELS = ("wheel_speed", "motor_torque")
 PEDALS = ("accelerator_pedal", "brake_pedal")
 #: Ways to say what the driver wants; a live mapping has one of them, or both pedals.
 DEMANDS = ("power_demand", "force_demand", "torque_demand", "acceleration_demand")
@@ -117,7 +121,7 @@ class SignalMapping(NamedTuple):
     Attributes
     ----------
     path : the file
-    sources : by signal; `wheel_speed` has one source for all wheels or four, each other signal one
+    sources : by signal; one of `OF_WHEELS` has one source for all wheels or four, each other signal one
     commands : by command; one sink for all wheels, four, or none
     """
 
@@ -131,12 +135,15 @@ class SignalMapping(NamedTuple):
 
     def with_wheel_names(self, names: tuple[str, ...]) -> SignalMapping:
         """The same with other names of the wheels, where wheels are found by name."""
-        wheels = tuple(s._replace(names=names) if s.names else s for s in self.sources.get("wheel_speed", ()))
+        sources = {
+            signal: tuple(s._replace(names=names) if s.names else s for s in found)
+            for signal, found in self.sources.items()
+        }
         commands = {
             kind: tuple(sink._replace(names=names) if sink.names else sink for sink in sinks)
             for kind, sinks in self.commands.items()
         }
-        return self._replace(sources=self.sources | ({"wheel_speed": wheels} if wheels else {}), commands=commands)
+        return self._replace(sources=sources, commands=commands)
 
     def check_live(self) -> None:
         """Refuse what the node could not drive with.
@@ -174,12 +181,12 @@ def load_mapping(path: Path | str | None = None) -> SignalMapping:
     sources: dict[str, tuple[Source, ...]] = {}
     for signal, entry in signals.items():
         key = dotted("signals", signal)
-        if signal == "wheel_speed" and isinstance(entry, list):
+        if signal in OF_WHEELS and isinstance(entry, list):
             if len(entry) != WHEELS:
                 raise ConfigError(file, key, f"{len(entry)} sources", "one for all wheels, or four")
             sources[signal] = tuple(_source(file, f"{key}[{i}]", signal, item) for i, item in enumerate(entry))
         else:
-            sources[signal] = (_source(file, key, signal, entry, wheels=signal == "wheel_speed"),)
+            sources[signal] = (_source(file, key, signal, entry, wheels=signal in OF_WHEELS),)
     commands = read_commands(file, content["commands"]) if "commands" in content else standard()
     return SignalMapping(file, sources, commands)
 

@@ -22,6 +22,7 @@ from iwm_power_manager.signals.mapping import (
     BATTERY,
     DEMANDS,
     JOINT_STATE,
+    OF_WHEELS,
     PEDALS,
     SIGNALS,
     WHEELS,
@@ -69,6 +70,21 @@ class MotionReading(NamedTuple):
     value: float
 
 
+class TorqueReading(NamedTuple):
+    """Torques the motors report, N m, with the names of their wheels."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+
+
+class DirectionReading(NamedTuple):
+    """Direction the driver asks for: 1 forwards, -1 reverse."""
+
+    stamp_ns: int
+    direction: float
+
+
 class NamedValues(NamedTuple):
     """One of a JointState's fields of numbers, with the names."""
 
@@ -77,7 +93,18 @@ class NamedValues(NamedTuple):
     values: tuple[float, ...]
 
 
-type Reading = SpeedReading | JointReading | BatteryReading | DemandReading | FrictionReading | MotionReading
+type Reading = (
+    SpeedReading
+    | JointReading
+    | BatteryReading
+    | DemandReading
+    | FrictionReading
+    | DirectionReading
+    | TorqueReading
+    | MotionReading
+)
+#: The reading of each signal of four wheels.
+_JOINTS: dict[str, type[JointReading | TorqueReading]] = {"wheel_speed": JointReading, "motor_torque": TorqueReading}
 type _Bind = Callable[[int, tuple[Any, ...], tuple[str, ...]], tuple[Reading, ...]]
 
 
@@ -107,15 +134,15 @@ class Assembly:
         self.speed_read_mps = 0.0
         self._speed_mps = speed_mps or (lambda: self.speed_read_mps)
         self._pedals = dict.fromkeys(PEDALS, 0.0)
-        self._wheels = [_NAN] * WHEELS
-        self._came = [0] * WHEELS
+        self._wheels = {signal: [_NAN] * WHEELS for signal in _JOINTS}
+        self._came = {signal: [0] * WHEELS for signal in _JOINTS}
 
     def demand_w(self, signal: str, value: float) -> float:
         """A demand in its own unit as power at the present speed, W."""
         if signal == "power_demand":
             return value
         assert self.vehicle is not None  # checked when the readers were made
-        speed = max(self._speed_mps(), 0.0)
+        speed = abs(self._speed_mps())
         if signal in DEMANDS:
             return float(demand_power_w(KINDS[signal], value, 0.0, speed, self.vehicle))
         # A pedal that says nothing is not pressed less far than it goes; NaN stays NaN and is refused.
@@ -132,15 +159,16 @@ class Assembly:
             if signal in DEMANDS or signal in PEDALS:
                 self.demand_w(signal, 0.0)
 
-    def wheel(self, wheel: int, time_ns: int, speed_radps: float) -> tuple[Reading, ...]:
-        """One wheel's speed; a reading once all four have come, or one of them has stayed away for long."""
-        self._wheels[wheel] = speed_radps
-        self._came[wheel] += 1
-        if 0 in self._came and self._came[wheel] < _MISSED_SETS:
+    def wheel(self, signal: str, wheel: int, time_ns: int, value: float) -> tuple[Reading, ...]:
+        """One wheel's number; a reading once all four have come, or one of them has stayed away for long."""
+        held, came = self._wheels[signal], self._came[signal]
+        held[wheel] = value
+        came[wheel] += 1
+        if 0 in came and came[wheel] < _MISSED_SETS:
             return ()
-        speeds = tuple(speed if came else _NAN for speed, came in zip(self._wheels, self._came, strict=True))
-        self._came = [0] * WHEELS
-        return (JointReading(time_ns, self.wheel_names, speeds),)
+        values = tuple(one if count else _NAN for one, count in zip(held, came, strict=True))
+        self._came[signal] = [0] * WHEELS
+        return (_JOINTS[signal](time_ns, self.wheel_names, values),)
 
 
 class TopicReader:
@@ -203,7 +231,7 @@ def _topic_reader(file: Path, types: Types, found: list[tuple[str, int, Source]]
     stamped = True
     binds: list[_Bind] = []
     for signal, wheel, source in found:
-        _check_source(file, types, source, all_wheels=signal == "wheel_speed" and wheel < 0)
+        _check_source(file, types, source, all_wheels=signal in OF_WHEELS and wheel < 0)
         _check_vehicle(file, signal, source, assembly.vehicle)
         place = fields.setdefault(source.field, len(fields))
         names = names or (names_path(source.field) if source.names else "")
@@ -262,13 +290,15 @@ def _bind(signal: str, wheel: int, source: Source, place: int, assembly: Assembl
     scale = _scale(source, assembly.vehicle.front.wheel.radius_m if assembly.vehicle else 1.0)
     if signal == "speed":
         return _bind_speed(place, scale, assembly)
-    if signal == "wheel_speed" and wheel < 0:
-        return _bind_wheels(source, place, scale, assembly)
+    if signal in OF_WHEELS and wheel < 0:
+        return _bind_wheels(_JOINTS[signal], source, place, scale, assembly)
     if signal == "power_demand" and scale is None:
         return lambda time_ns, values, _: (DemandReading(time_ns, values[place]),)
     scaled = scale or (lambda value: value)
-    if signal == "wheel_speed":
-        return lambda time_ns, values, _: assembly.wheel(wheel, time_ns, scaled(values[place]))
+    if signal in OF_WHEELS:
+        return lambda time_ns, values, _: assembly.wheel(signal, wheel, time_ns, scaled(values[place]))
+    if signal == "direction":
+        return lambda time_ns, values, _: _direction(time_ns, scaled(values[place]))
     if signal in DEMANDS or signal in PEDALS:
         return lambda time_ns, values, _: (DemandReading(time_ns, assembly.demand_w(signal, scaled(values[place]))),)
     if signal == "friction":
@@ -286,7 +316,18 @@ def _bind_speed(place: int, scale: Callable[[float], float] | None, assembly: As
     return speed
 
 
-def _bind_wheels(source: Source, place: int, scale: Callable[[float], float] | None, assembly: Assembly) -> _Bind:
+def _direction(time_ns: int, value: float) -> tuple[Reading, ...]:
+    """Above zero is forwards, below is reverse; zero (neutral) and NaN change nothing."""
+    return (DirectionReading(time_ns, math.copysign(1.0, value)),) if value < 0.0 or value > 0.0 else ()
+
+
+def _bind_wheels(
+    kind: type[JointReading | TorqueReading],
+    source: Source,
+    place: int,
+    scale: Callable[[float], float] | None,
+    assembly: Assembly,
+) -> _Bind:
     """Four wheels in one message: by name, under the controller's names, or as an array in the right order."""
     ours = dict(zip(source.names, assembly.wheel_names, strict=True)) if source.names else {}
     signs = dict(zip(source.names or assembly.wheel_names, source.signs, strict=True)) if source.signs else {}
@@ -306,7 +347,7 @@ def _bind_wheels(source: Source, place: int, scale: Callable[[float], float] | N
             speeds = tuple(map(scale, speeds))
         if turned and len(turned) == len(speeds):
             speeds = tuple(sign * speed for sign, speed in zip(turned, speeds, strict=True))
-        return (JointReading(time_ns, known, speeds),)
+        return (kind(time_ns, known, speeds),)
 
     return wheels
 

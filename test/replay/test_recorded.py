@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from bags_helpers import TWIST, ScriptedDrive, float64, topic, twist
+from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.model.pedals import pedal_power_w
-from iwm_power_manager.replay.recorded import read_signal
+from iwm_power_manager.replay.recorded import SignalStream, read_signal
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.mapping import load_mapping
+from iwm_power_manager.signals.mapping import JOINT_STATE, load_mapping
+from iwm_power_manager.signals.readings import joint_state_writer
 from iwm_power_manager.vehicle import load_vehicle
 
 S = 1_000_000_000
@@ -101,3 +103,15 @@ def test_a_drive_of_this_project_reads_as_it_was_driven(tmp_path: Path) -> None:
     assert drive.power_demand_w.tolist() == [script.inputs(i)[2] for i in range(40)]
     assert drive.speed_mps.tolist() == [script.inputs(i)[0] for i in range(40)]
     np.testing.assert_allclose(np.diff(drive.time_s), 0.01, atol=1e-12)
+
+
+def test_a_wheel_that_is_missing_is_named_whatever_the_order_of_the_message(tmp_path: Path) -> None:
+    names = ["rear_right", "front_left", "steering", "rear_left"]
+    data = joint_state_writer(names, "velocity")(5 * S, [4.0, math.nan, 0.0, 3.0])
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write(bag.add_topic(topic("/wheel_states", JOINT_STATE)), 1, data)
+    with BagReader(tmp_path / "bag") as reader:
+        stream = SignalStream(reader, load_mapping())
+        (found,) = list(stream)
+    assert found.reading.names == tuple(names)
+    assert list(stream.without) == ["/wheel_states: front_left"]

@@ -30,9 +30,11 @@ from iwm_power_manager.signals.mapping import load_mapping
 from iwm_power_manager.signals.readings import (
     Assembly,
     DemandReading,
+    DirectionReading,
     FrictionReading,
     MotionReading,
     TopicReader,
+    TorqueReading,
     topic_readers,
 )
 from iwm_power_manager.signals.types import types_of
@@ -237,6 +239,25 @@ def test_several_signals_of_one_message_are_read_at_once(tmp_path: Path) -> None
         MotionReading(0, "yaw_rate", 0.5),
         MotionReading(0, "longitudinal_acceleration", -2.0),
     )
+
+
+def test_torques_that_motors_report_come_beside_their_speeds(tmp_path: Path) -> None:
+    joints = "topic: w, type: sensor_msgs/msg/JointState, names: [fl, fr, rl, rr]"
+    speeds, torques = f"{joints}, field: velocity, unit: rad/s", f"{joints}, field: effort, unit: N m"
+    quick = read_from(tmp_path, f"  wheel_speed: {{{speeds}}}\n  motor_torque: {{{torques}}}")["w"]
+    sent = messages.joint_message(5, ["rr", "fl"], velocity=[4.0, 1.0], effort=[40.0, 10.0])
+    names = ("rear_right", "front_left")
+    assert quick(serialize_message(sent), 0) == (
+        JointReading(5, names, (4.0, 1.0)),
+        TorqueReading(5, names, (40.0, 10.0)),
+    )
+
+
+def test_a_direction_is_forwards_or_reverse_and_neutral_changes_nothing(tmp_path: Path) -> None:
+    quick = read_from(tmp_path, '  direction: {topic: g, type: std_msgs/msg/Int8, field: data, unit: "1"}')["g"]
+    kind = messages.message_class("std_msgs/msg/Int8")
+    found = [quick(serialize_message(kind(data=gear)), 3) for gear in (3, -1, 0)]
+    assert found == [(DirectionReading(3, 1.0),), (DirectionReading(3, -1.0),), ()]
 
 
 def test_the_time_dds_says_counts_where_the_stamp_is_not_wanted(tmp_path: Path) -> None:
