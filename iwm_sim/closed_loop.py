@@ -245,6 +245,7 @@ def measure(
         discharge,
         charge,
         soc,
+        (1.0, 1.0, 1.0, 1.0),
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.settings import Settings, default_settings
-from iwm_power_manager.control.thresholds import Thresholds, input_limits, supervision_limits
+from iwm_power_manager.control.thresholds import Thresholds, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.replay.plan import PolicyBank
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.closed_loop import BATTERY_TEMPERATURE_DEGC, Run, decision_of
@@ -72,6 +72,7 @@ def controller_of(scenario: Scenario, settings: Settings | None = None, policies
         inputs=input_limits(thresholds, params.front.wheel.radius_m, by_clock=True),
         age_s=AGES_S,
         supervision=supervision_limits(thresholds),
+        actuators=actuator_limits(thresholds),
     )
     table = PolicyBank(policies, (0.0, 0.5, 0.0, 0.5), vehicle).table(settings.strategy, scenario.told_friction)
     return Controller(params, WHEELS, limits, settings, table, scenario.told_friction)
@@ -84,6 +85,7 @@ def give(controller: Controller, sensors: Sensors, drive: Drive, now_ns: int) ->
         monitor.take_speed(SpeedReading(now_ns, sensors.speed_mps), now_ns)
     if not drive.lost("wheel_states"):
         monitor.take_wheels(JointReading(now_ns, WHEELS, sensors.wheel_speed_radps), now_ns)
+        monitor.take_torques(JointReading(now_ns, WHEELS, sensors.motor_torque_nm))
     if not drive.lost("battery_state"):
         battery = BatteryReading(
             now_ns,

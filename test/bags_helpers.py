@@ -17,7 +17,7 @@ from iwm_power_manager.control.monitor import BatteryReading, JointReading, Spee
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.thresholds import RECORDED, input_limits, supervision_limits
+from iwm_power_manager.control.thresholds import RECORDED, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.policy import choose, load_policy_bank
 from iwm_power_manager.replay.run import COMPUTED
 from iwm_power_manager.share import share_path
@@ -61,7 +61,9 @@ class ScriptedDrive:
         # No price for a change of the share: so that the strategy does something in a second.
         self.parameters: dict[str, str | float] = {"strategy": strategy, "switching_power_w": 0.0}
         self.settings = default_settings(strategy)._replace(switching_power_w=0.0)
-        limits = ControllerLimits(input_limits(RECORDED, 0.33, by_clock=False), None, supervision_limits(RECORDED))
+        limits = ControllerLimits(
+            input_limits(RECORDED, 0.33, by_clock=False), None, supervision_limits(RECORDED), actuator_limits(RECORDED)
+        )
         table = empty_table()
         if policy_file is not None:
             self.parameters["policy_file"] = str(policy_file)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.actuators import ActuatorLimits, ActuatorState, commanded, judge
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import InputLimits, InputMonitor
@@ -46,11 +47,13 @@ class ControllerLimits(NamedTuple):
     inputs : checks of every message
     age_s : ages at which speed, wheels, demand and battery are missing; None in lock-step, where nothing can be missing
     supervision : times of the degraded state
+    actuators : what is believed of reported motor torques
     """
 
     inputs: InputLimits
     age_s: tuple[float, float, float, float] | None
     supervision: SupervisionLimits
+    actuators: ActuatorLimits
 
 
 class Step(NamedTuple):
@@ -67,6 +70,7 @@ class Controller:
     ----------
     monitor : takes the readings
     supervision : degraded state after the last step
+    actuators : what is known of the motors
     settings, policy, friction : may be replaced between steps; torque follows through the law's own rate limits
     command : last command
     """
@@ -92,6 +96,8 @@ class Controller:
         """Forget inputs and memory, as at activation."""
         self.monitor.forget()
         self.supervision = Supervision() if self._limits.age_s else LOCKSTEP_SUPERVISION
+        self.actuators = ActuatorState()
+        self._unreported_s = 0.0
         self.state = initial_state()
         self.command: Command | None = None
 
@@ -121,6 +127,7 @@ class Controller:
             stale = stale_inputs(age_s, self._limits.age_s)
             passed_s = max(elapsed_s or dt_s, dt_s) if stale else dt_s
             self.supervision = supervise(self.supervision, stale, passed_s, self._limits.supervision)
+        self._watch_motors(dt_s)
         measurement = self._measurement(dt_s)
         settings = self._settings()
         command, after = law.step(measurement, self.state, settings, self._vehicle, self.policy)
@@ -131,7 +138,16 @@ class Controller:
         values = to_numbers(measurement, settings, command, self.state, after, self.supervision, watch)
         self.state = after
         self.command = command
+        self.actuators = commanded(self.actuators, command.motor_torque_nm, dt_s, self._limits.actuators)
         return Step(command, values)
+
+    def _watch_motors(self, dt_s: float) -> None:
+        """Hold what the motors report against what they were told."""
+        self._unreported_s += dt_s
+        reported = self.monitor.collect_torques()
+        if reported is not None:
+            self.actuators = judge(self.actuators, reported, self._unreported_s, self._limits.actuators)
+            self._unreported_s = 0.0
 
     def _measurement(self, dt_s: float) -> Measurement:
         monitor, supervision = self.monitor, self.supervision
@@ -146,7 +162,17 @@ class Controller:
         demand = shape_demand(monitor.demand_w, monitor.demand_speed_mps, speed, supervision)
         discharge, charge = battery_limits_w(monitor.soc, monitor.temperature_c, self._vehicle.battery)
         factor = supervision.motor_factor
-        return Measurement(speed, wheels, demand, dt_s, self.friction, discharge * factor, charge * factor, monitor.soc)
+        return Measurement(
+            speed_mps=speed,
+            wheel_speed_radps=wheels,
+            power_demand_w=demand,
+            dt_s=dt_s,
+            friction=self.friction,
+            discharge_limit_w=discharge * factor,
+            charge_limit_w=charge * factor,
+            soc=monitor.soc,
+            motor_gain=self.actuators.gains,
+        )
 
     def _settings(self) -> Settings:
         if not self.wheels_lost:

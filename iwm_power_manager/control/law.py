@@ -65,6 +65,7 @@ class Wheel(NamedTuple):
     slip : filtered
     gated : held at zero torque
     actuator_nm : largest torque of motor or brake in the direction of the demand
+    gain : part of a commanded torque that its motor delivers
     grip_nm : largest torque the slip limiter allows
     """
 
@@ -75,6 +76,7 @@ class Wheel(NamedTuple):
     slip: float
     gated: bool
     actuator_nm: float
+    gain: float
     grip_nm: float
 
 
@@ -108,6 +110,7 @@ def _wheel(
     gate_slip: float,
     speed_mps: float,
     demand_w: float,
+    gain: float,
     dt_s: float,
     first: bool,
     before: WheelState,
@@ -151,7 +154,10 @@ def _wheel(
         road_nm=road,
         slip=slip,
         gated=gated,
-        actuator_nm=axle.friction_brake.max_torque_nm if braking else torque_limit_nm(fast, before.heat, axle.motor),
+        actuator_nm=axle.friction_brake.max_torque_nm
+        if braking
+        else gain * torque_limit_nm(fast, before.heat, axle.motor),
+        gain=gain,
         grip_nm=grip,
     )
 
@@ -180,6 +186,12 @@ def _rooms_nm(
 
 
 @kernel
+def _commanded_nm(torque_nm: float, gain: float) -> float:
+    """Torque to command so that `torque_nm` arrives."""
+    return torque_nm / gain if gain > 0.0 else 0.0
+
+
+@kernel
 def _given(
     total_nm: float,
     wheel: Wheel,
@@ -190,8 +202,9 @@ def _given(
     settings: Settings,
     axle: Axle,
 ) -> Given:
-    """Steps 5 and 6 for one wheel."""
-    motor, friction = blend(total_nm, wheel.fast_radps, speed_mps, before.heat, axle.motor)
+    """Steps 5 and 6 for one wheel. A weak motor is commanded more than it is to deliver, within the same limits."""
+    motor, friction = blend(total_nm, wheel.fast_radps, speed_mps, before.heat, wheel.gain, axle.motor)
+    motor = _commanded_nm(motor, wheel.gain)
     torque = slewed(
         before.motor_nm,
         motor,
@@ -201,15 +214,16 @@ def _given(
         settings.slew_regeneration_nmps,
     )
     # A gate or a limit cuts at once.
-    if wheel.gated:
+    if wheel.gated or wheel.gain == 0.0:
         torque = 0.0
     else:
+        grip = wheel.grip_nm / wheel.gain
         most = torque_limit_nm(wheel.fast_radps, before.heat, axle.motor)
         least = regeneration_limit_nm(wheel.fast_radps, speed_mps, before.heat, axle.motor)
         if braking:
-            least = min(least, wheel.grip_nm)
+            least = min(least, grip)
         else:
-            most = min(most, wheel.grip_nm)
+            most = min(most, grip)
         torque = min(max(torque, -least), most)
         if abs(torque) <= ZERO_TORQUE_NM:
             torque = 0.0
@@ -237,14 +251,14 @@ def _limits(wheel: Wheel, given: Given, short: bool, braking: bool, axle: Axle) 
 
 
 @kernel
-def _friction_nm(given: Given, motor_nm: float, braking: bool, axle: Axle) -> float:
-    """Friction torque that makes up, with what the motor does, the braking torque asked for.
+def _friction_nm(given: Given, delivered_nm: float, braking: bool, axle: Axle) -> float:
+    """Friction torque that makes up, with what the motor delivers, the braking torque asked for.
 
     A motor that is still on its way down from driving is held against: braking gets through at once.
     """
     if not braking:
         return given.friction_nm
-    return max(min(given.total_nm - motor_nm, 0.0), -axle.friction_brake.max_torque_nm)
+    return max(min(given.total_nm - delivered_nm, 0.0), -axle.friction_brake.max_torque_nm)
 
 
 @kernel
@@ -254,7 +268,7 @@ def _after(
     """What is remembered of a wheel."""
     return WheelState(
         motor_nm=motor_nm,
-        total_nm=motor_nm + friction_nm,
+        total_nm=wheel.gain * motor_nm + friction_nm,
         speed_radps=wheel.speed_radps,
         road_nm=wheel.road_nm,
         slip=wheel.slip,
@@ -290,6 +304,8 @@ def step(
     braking = demand < 0.0
     first = state.steps == 0
 
+    gain = measurement.motor_gain
+
     # 1. slip, wheel by wheel; an axle's is that of its worse wheel
     w = measurement.wheel_speed_radps
     fl_slip = _slip(w[0], speed, dt, first, fl0, front, settings)
@@ -306,10 +322,10 @@ def step(
     printed = settings.gate_mode == GATE_MODE_TABLE2
     fl_gate, fr_gate = (front_slip, front_slip) if printed else (fl_slip, fr_slip)
     rl_gate, rr_gate = (rear_slip, rear_slip) if printed else (rl_slip, rr_slip)
-    fl = _wheel(w[0], fl_slip, fl_gate, speed, demand, dt, first, fl0, front, settings, vehicle)
-    fr = _wheel(w[1], fr_slip, fr_gate, speed, demand, dt, first, fr0, front, settings, vehicle)
-    rl = _wheel(w[2], rl_slip, rl_gate, speed, demand, dt, first, rl0, rear, settings, vehicle)
-    rr = _wheel(w[3], rr_slip, rr_gate, speed, demand, dt, first, rr0, rear, settings, vehicle)
+    fl = _wheel(w[0], fl_slip, fl_gate, speed, demand, gain[0], dt, first, fl0, front, settings, vehicle)
+    fr = _wheel(w[1], fr_slip, fr_gate, speed, demand, gain[1], dt, first, fr0, front, settings, vehicle)
+    rl = _wheel(w[2], rl_slip, rl_gate, speed, demand, gain[2], dt, first, rl0, rear, settings, vehicle)
+    rr = _wheel(w[3], rr_slip, rr_gate, speed, demand, gain[3], dt, first, rr0, rear, settings, vehicle)
     front_gated = fl.gated and fr.gated
     rear_gated = rl.gated and rr.gated
     fl_room, fr_room, front_unequal = _rooms_nm(
@@ -355,12 +371,15 @@ def step(
         power = wheels_power_w(wanted, w, 1.0, vehicle)
         limits |= LIMIT_BATTERY_CHARGE if power < 0.0 else LIMIT_BATTERY_DISCHARGE
     motor = (scale * wanted[0], scale * wanted[1], scale * wanted[2], scale * wanted[3])
+    delivered = (gain[0] * motor[0], gain[1] * motor[1], gain[2] * motor[2], gain[3] * motor[3])
     friction = (
-        _friction_nm(fl_given, motor[0], braking, front),
-        _friction_nm(fr_given, motor[1], braking, front),
-        _friction_nm(rl_given, motor[2], braking, rear),
-        _friction_nm(rr_given, motor[3], braking, rear),
+        _friction_nm(fl_given, delivered[0], braking, front),
+        _friction_nm(fr_given, delivered[1], braking, front),
+        _friction_nm(rl_given, delivered[2], braking, rear),
+        _friction_nm(rr_given, delivered[3], braking, rear),
     )
+    fl_nm, fr_nm = delivered[0] + friction[0], delivered[1] + friction[1]
+    rl_nm, rr_nm = delivered[2] + friction[2], delivered[3] + friction[3]
 
     command = Command(
         motor_torque_nm=motor,
@@ -369,8 +388,8 @@ def step(
         decided_share=memory.decided_share,
         gate=(1 if front_gated else 0) + (2 if rear_gated else 0),
         limits=limits,
-        front_power_w=fl.conversion_radps * (motor[0] + friction[0]) + fr.conversion_radps * (motor[1] + friction[1]),
-        rear_power_w=rl.conversion_radps * (motor[2] + friction[2]) + rr.conversion_radps * (motor[3] + friction[3]),
+        front_power_w=fl.conversion_radps * fl_nm + fr.conversion_radps * fr_nm,
+        rear_power_w=rl.conversion_radps * rl_nm + rr.conversion_radps * rr_nm,
         front_slip=front_slip,
         rear_slip=rear_slip,
         gated_wheels=(1 if fl.gated else 0) + (2 if fr.gated else 0) + (4 if rl.gated else 0) + (8 if rr.gated else 0),

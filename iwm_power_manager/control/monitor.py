@@ -142,6 +142,7 @@ class InputMonitor:
     speed_mps, wheel_speed_radps, demand_w, soc, temperature_c, friction : last accepted values
     demand_speed_mps : speed of the car when the last demand was accepted
     verdicts : what was wrong with each wheel in the last `wheel_states`
+    motor_torque_nm : torques the motors reported since `collect_torques` was called last, NaN for each that did not
     tallies : counters by topic
     """
 
@@ -161,6 +162,7 @@ class InputMonitor:
         self.temperature_c = math.nan
         self.friction = math.nan
         self.verdicts = (WheelVerdict.GOOD,) * 4
+        self.motor_torque_nm: Wheels | None = None
         self._wheel_memory = NEW_WHEELS
         self.forget_times()
 
@@ -229,6 +231,16 @@ class InputMonitor:
             tally.violation = violation
             tally.dropped[violation] += 1
         return True
+
+    def take_torques(self, reading: JointReading) -> None:
+        """Keep what the motors report. Nothing is judged here: `control.actuators` holds it against the commands."""
+        a, b, c, d = select_by_name(reading, self._wheel_names)
+        self.motor_torque_nm = (a, b, c, d)
+
+    def collect_torques(self) -> Wheels | None:
+        """The latest report of the motors' torques, once; None if none has come since."""
+        reported, self.motor_torque_nm = self.motor_torque_nm, None
+        return reported
 
     def take_demand(self, demand_w: float, delay_s: float, now_ns: int) -> bool:
         """Judge `power_demand`, received `delay_s` after it was sent; True if it was accepted."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from iwm_power_manager.control.settings import DEFAULTS, Settings
 from iwm_power_manager.control.supervision import Supervision
-from iwm_power_manager.control.types import WHEEL_NAMES, Command, ControllerState, Measurement
+from iwm_power_manager.control.types import WHEEL_NAMES, Command, ControllerState, Measurement, Wheels
 
 _SETTING = "setting."
 
@@ -35,6 +35,7 @@ _MEASUREMENT = (
     Signal("discharge_limit_w", "electrical power the battery may give"),
     Signal("charge_limit_w", "electrical power the battery may take"),
     Signal("soc", "state of charge, 0..1"),
+    *(Signal(f"{wheel}_motor_gain", "part of a commanded torque the motor delivers, 0..1") for wheel in WHEEL_NAMES),
 )
 _COMMAND = (
     *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in WHEEL_NAMES),
@@ -106,7 +107,8 @@ def to_numbers(
     return [
         measurement.speed_mps,
         *measurement.wheel_speed_radps,
-        *measurement[2:],
+        *measurement[2:-1],
+        *measurement.motor_gain,
         *decided(command, before, after),
         *supervision[:4],
         watch.wheels_lost,
@@ -117,7 +119,7 @@ def to_numbers(
 
 
 #: What a record that is older than a signal would have said.
-YOUNGER_SIGNALS = {"gated_wheels": 0.0}
+YOUNGER_SIGNALS = {"gated_wheels": 0.0} | {f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES}
 
 #: The signals the law decides.
 DECIDED_NAMES = tuple(signal.name for signal in (*_COMMAND, *_CONTROLLER))
@@ -152,8 +154,22 @@ def from_numbers(values: Mapping[str, float]) -> RecordedStep:
     KeyError
         A signal is missing: the record was not made by this project, or by another version of it.
     """
-    taken = [float(values[signal.name]) for signal in _MEASUREMENT]
-    measurement = Measurement(taken[0], (taken[1], taken[2], taken[3], taken[4]), *taken[5:])
+
+    def wheels(signal: str) -> Wheels:
+        fl, fr, rl, rr = (float(values[f"{wheel}_{signal}"]) for wheel in WHEEL_NAMES)
+        return (fl, fr, rl, rr)
+
+    measurement = Measurement(
+        speed_mps=float(values["speed_mps"]),
+        wheel_speed_radps=wheels("speed_radps"),
+        power_demand_w=float(values["power_demand_w"]),
+        dt_s=float(values["dt_s"]),
+        friction=float(values["friction"]),
+        discharge_limit_w=float(values["discharge_limit_w"]),
+        charge_limit_w=float(values["charge_limit_w"]),
+        soc=float(values["soc"]),
+        motor_gain=wheels("motor_gain"),
+    )
     # Integers and flags travel as numbers; the law has to get back the types it was compiled for.
     # A setting that is younger than the record has its default.
     settings = DEFAULTS._replace(

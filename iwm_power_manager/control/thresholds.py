@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, NamedTuple
 
+from iwm_power_manager.control.actuators import ActuatorLimits
 from iwm_power_manager.control.inputs import StampLimits, ValueLimits, WheelLimits
 from iwm_power_manager.control.monitor import InputLimits
 from iwm_power_manager.control.settings import Change, Setting, table_of
@@ -86,6 +87,24 @@ class Thresholds(NamedTuple):
         float,
         _threshold("a lost wheel has to be good for this long before it is used again", "s", 0.0, 60.0),
     ] = 0.5
+    # A torque is reckoned from currents: to a tenth or so at best.
+    motor_tolerance_nm: Annotated[
+        float, _threshold("difference of reported and commanded motor torque that is always believed", "N m", 0.1, 1e3)
+    ] = 8.0
+    motor_tolerance_ratio: Annotated[
+        float, _threshold("the same as a part of the commanded torque, on top", "", 0.0, 1.0)
+    ] = 0.15
+    # Three periods of a slow bus, the motor's own lag, and a message each way.
+    motor_lag_s: Annotated[
+        float, _threshold("a reported motor torque may belong to any command of this time", "s", 0.0, 1.0)
+    ] = 0.06
+    motor_confirm_s: Annotated[
+        float, _threshold("a motor whose reports differ for longer is weak, dead, stuck or reversed", "s", 0.01, 60.0)
+    ] = 0.1
+    motor_recover_s: Annotated[
+        float,
+        _threshold("a weak motor has to follow for this long to count as good again", "s", 0.0, 600.0),
+    ] = 2.0
     demand_max_w: Annotated[float, _threshold("largest believed driving demand", "W", 100.0, 5e6)] = 150e3
     demand_min_w: Annotated[float, _threshold("largest believed braking demand, negative", "W", -2e7, -100.0)] = -600e3
     demand_rise_wps: Annotated[
@@ -183,7 +202,20 @@ RECORDED = Thresholds()._replace(
     wheel_stuck_s=_INF,
     wheel_stray_s=_INF,
     wheel_stray_radps=500.0,
+    motor_confirm_s=_INF,
 )
+
+
+def actuator_limits(thresholds: Thresholds) -> ActuatorLimits:
+    """What is believed of reported motor torques."""
+    t = thresholds
+    return ActuatorLimits(
+        tolerance_nm=t.motor_tolerance_nm,
+        tolerance_ratio=t.motor_tolerance_ratio,
+        lag_s=t.motor_lag_s,
+        confirm_s=t.motor_confirm_s,
+        recover_s=t.motor_recover_s,
+    )
 
 
 def supervision_limits(thresholds: Thresholds) -> SupervisionLimits:

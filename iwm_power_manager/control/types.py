@@ -52,6 +52,7 @@ class Measurement(NamedTuple):
     discharge_limit_w : electrical power the battery may give, >= 0
     charge_limit_w : electrical power the battery may take, >= 0
     soc : state of charge, 0..1
+    motor_gain : part of a commanded torque that each motor delivers, 0..1; 0 switches it off
     """
 
     speed_mps: float
@@ -62,6 +63,7 @@ class Measurement(NamedTuple):
     discharge_limit_w: float
     charge_limit_w: float
     soc: float
+    motor_gain: Wheels = (1.0, 1.0, 1.0, 1.0)
 
 
 class Command(NamedTuple):
@@ -99,7 +101,7 @@ class WheelState(NamedTuple):
     Attributes
     ----------
     motor_nm : motor torque of the last command
-    total_nm : the same with the friction brake
+    total_nm : what of it arrived, with the friction brake
     speed_radps : wheel speed in the last step
     road_nm : filtered estimate of the torque the road takes from the wheel
     slip : filtered slip

@@ -171,7 +171,7 @@ def _axle_torque(
         if torque > limit:
             return limit, 0.0, 2.0 * (torque - limit) * conversion
         return torque, 0.0, 0.0
-    motor, friction = blend(torque, wheel_speed_radps, speed_mps, 0.0, vehicle.front.motor)
+    motor, friction = blend(torque, wheel_speed_radps, speed_mps, 0.0, 1.0, vehicle.front.motor)
     return motor, max(friction, -vehicle.front.friction_brake.max_torque_nm), 0.0
 
 

@@ -52,11 +52,12 @@ def between_wheels(
 
 @kernel
 def blend(
-    torque_nm: float, wheel_speed_radps: float, speed_mps: float, heat: float, motor: Motor
+    torque_nm: float, wheel_speed_radps: float, speed_mps: float, heat: float, gain: float, motor: Motor
 ) -> tuple[float, float]:
     """Share a wheel's torque between its motor and its friction brake (eq. 20, 41, 42).
 
-    Driving is the motor's. Braking is the motor's up to the regeneration limit, the rest is friction's.
+    Driving is the motor's. Braking is the motor's up to the part `gain` of the regeneration limit, which a weak motor
+    delivers, the rest is friction's.
 
     Returns
     -------
@@ -64,5 +65,5 @@ def blend(
     """
     if torque_nm >= 0.0:
         return torque_nm, 0.0
-    regeneration = min(-torque_nm, regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, motor))
+    regeneration = min(-torque_nm, gain * regeneration_limit_nm(wheel_speed_radps, speed_mps, heat, motor))
     return -regeneration, torque_nm + regeneration

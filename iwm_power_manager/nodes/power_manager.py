@@ -573,7 +573,12 @@ class PowerManager(KeepsItsValues, LifecycleNode):
             elif self._fault and self._stepper is not None and self._stepper.last_ns is not None:
                 self._fault = ""
             self._says.stepped(controller, self._topics, self._unheard)
-        shown = controller and (controller.supervision.mode, controller.supervision.stale, controller.wheels_lost)
+        shown = controller and (
+            controller.supervision.mode,
+            controller.supervision.stale,
+            controller.wheels_lost,
+            controller.actuators.gains,
+        )
         gate = controller and controller.command and controller.command.gate
         if self._changes.changed((self._active, self._fault, shown, gate), time.monotonic()):
             self._report_soon(stepping)

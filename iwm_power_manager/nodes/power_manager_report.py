@@ -73,6 +73,7 @@ class PowerManagerReport:
                     self._wheel_names,
                 )
             )
+            statuses.append(diagnostics.motors_status(controller.actuators, self._wheel_names))
             statuses.append(self._loop.report(self._rate_hz, values))
         self._activity.clear()
         return diagnostics.to_message(now_ns, self._node_name, [*statuses, *extra])

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from iwm_power_manager.control.controller import Controller, ControllerLimits
-from iwm_power_manager.control.thresholds import input_limits, supervision_limits
+from iwm_power_manager.control.thresholds import actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.errors import BagError, ConfigError, IwmError
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
@@ -68,6 +68,7 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
         input_limits(thresholds, vehicle.params.front.wheel.radius_m, by_clock=not values["lockstep"]),
         None if values["lockstep"] else config.age_limits_s(values),
         supervision_limits(thresholds),
+        actuator_limits(thresholds),
     )
     names = tuple(values["wheel_names"])
     table = policies.table(values["friction"])

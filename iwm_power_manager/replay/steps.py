@@ -22,7 +22,7 @@ from iwm_power_manager.control.monitor import (
 )
 from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, decided, from_numbers
 from iwm_power_manager.control.stepping import AsRecorded, Lockstep, Taken
-from iwm_power_manager.control.thresholds import RECORDED, input_limits, supervision_limits
+from iwm_power_manager.control.thresholds import RECORDED, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.control.types import Command, ControllerState, initial_state
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import Recorded
@@ -143,7 +143,10 @@ class ReconstructedSteps:
         self.in_sets = _in_sets(probe)
         vehicle = plan.vehicle.params
         limits = ControllerLimits(
-            input_limits(RECORDED, vehicle.front.wheel.radius_m, by_clock=False), None, supervision_limits(RECORDED)
+            input_limits(RECORDED, vehicle.front.wheel.radius_m, by_clock=False),
+            None,
+            supervision_limits(RECORDED),
+            actuator_limits(RECORDED),
         )
         table = plan.policies.table(plan.settings.strategy, plan.friction)
         self._controller = Controller(vehicle, WHEEL_NAMES, limits, plan.settings, table, plan.friction)
@@ -244,4 +247,3 @@ def _in_sets(probe: Iterable[Recorded]) -> bool:
             stamps[type(value.reading)].add(value.reading.stamp_ns)
     common = set.intersection(*stamps.values())
     return len(common) > 1 and len(common) >= max(map(len, stamps.values())) - 2
-

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from iwm_power_manager.control.actuators import ActuatorState, MotorVerdict
 from iwm_power_manager.control.inputs import Violation, WheelVerdict
 from iwm_power_manager.control.monitor import Tally
 from iwm_power_manager.control.supervision import MODE_NAMES, MODE_NORMAL, STALE_NAMES, Supervision
@@ -205,5 +206,18 @@ def control_status(
     return Status("control", ERROR if missing else WARN, f"{mode}{reason}", values)
 
 
-def _words(code: Violation | WheelVerdict) -> str:
+def motors_status(actuators: ActuatorState, wheel_names: Sequence[str]) -> Status:
+    """Which motors do not do what they are told, and what of their torque is counted on."""
+    values = {"reported torque": "judged" if actuators.reporting else "none that follows the commands"}
+    problems: list[tuple[int, str]] = []
+    for name, motor in zip(wheel_names, actuators.motors, strict=True):
+        values[f"motor {name}"] = _words(motor.verdict)
+        values[f"motor {name}: counted on (%)"] = f"{100.0 * motor.gain:.0f}"
+        if motor.verdict is not MotorVerdict.GOOD:
+            problems.append((ERROR, f"motor {name} is {_words(motor.verdict)}"))
+    level, message = _worst(problems)
+    return Status("motors", level, message, values)
+
+
+def _words(code: Violation | WheelVerdict | MotorVerdict) -> str:
     return code.name.lower().replace("_", " ")

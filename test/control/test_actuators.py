@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iwm_power_manager.control import law
 from iwm_power_manager.control.actuators import (
     ActuatorLimits,
     ActuatorState,
@@ -15,6 +17,12 @@ from iwm_power_manager.control.actuators import (
     commanded,
     judge,
 )
+from iwm_power_manager.control.guard import violated_bound
+from iwm_power_manager.control.settings import default_settings
+from iwm_power_manager.control.table import empty_table
+from iwm_power_manager.control.types import Measurement, initial_state
+from iwm_power_manager.share import resolve
+from iwm_power_manager.vehicle import load_vehicle
 
 LIMITS = ActuatorLimits(tolerance_nm=6.0, tolerance_ratio=0.1, lag_s=0.05, confirm_s=0.1, recover_s=2.0)
 DT = 0.01
@@ -131,3 +139,42 @@ def test_one_report_gone_wrong_is_forgotten():
 def test_a_gain_is_a_part_whatever_is_reported(reports):
     for state in drive(following(), steady(60.0, len(reports)), reports):
         assert all(0.0 <= gain <= 1.0 for gain in state.gains)
+
+
+# --- In the law ------------------------------------------------------------------------------------------------------
+
+CAR = load_vehicle(resolve(Path("config/vehicles/jalalmaab_2015.yaml"))).params
+
+
+def settled(demand_w, gain, steps=100):
+    """The command of a car at 10 m/s that has followed the same demand for a second."""
+    state = initial_state()
+    for _ in range(steps):
+        measurement = Measurement(
+            speed_mps=10.0,
+            wheel_speed_radps=(10.0 / 0.33,) * 4,
+            power_demand_w=demand_w,
+            dt_s=DT,
+            friction=0.9,
+            discharge_limit_w=47500.0,
+            charge_limit_w=47500.0,
+            soc=0.8,
+            motor_gain=gain,
+        )
+        command, state = law.step(measurement, state, default_settings("equal"), CAR, empty_table())
+    return command
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("gain", [0.0, 0.4, 0.8])
+@pytest.mark.parametrize("demand_w", [-30000.0, -5000.0, 3000.0, 6000.0])
+def test_what_a_motor_has_lost_comes_from_the_others_and_the_brakes(wheel, gain, demand_w):
+    gains = tuple(gain if i == wheel else 1.0 for i in range(4))
+    command = settled(demand_w, gains)
+    arrived = [g * m + f for g, m, f in zip(gains, command.motor_torque_nm, command.friction_torque_nm, strict=True)]
+    assert sum(arrived) * 10.0 / 0.33 == pytest.approx(demand_w, rel=1e-6)
+    if gain == 0.0:
+        assert command.motor_torque_nm[wheel] == 0.0
+    assert not violated_bound(command, CAR)
+    if demand_w < 0.0:
+        assert arrived == pytest.approx([demand_w * 0.33 / 40.0] * 4)

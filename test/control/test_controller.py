@@ -30,7 +30,7 @@ from iwm_power_manager.control.supervision import (
     SupervisionLimits,
 )
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.thresholds import Thresholds, input_limits
+from iwm_power_manager.control.thresholds import Thresholds, actuator_limits, input_limits
 from iwm_power_manager.control.types import GATE_BOTH, GATE_FRONT, GATE_REAR, initial_state
 from iwm_power_manager.model.limits import car_power_w
 from iwm_power_manager.nodes import power_manager_config as config
@@ -47,6 +47,7 @@ LIMITS = ControllerLimits(
     input_limits(Thresholds(), RADIUS, by_clock=True),
     config.age_limits_s(VALUES),
     SupervisionLimits(0.3, 2.0, 0.1, 0.2),
+    actuator_limits(Thresholds()),
 )
 #: For coverage and mutation the law runs as plain Python.
 EXAMPLES = 60 if numba_config.DISABLE_JIT else max(settings().max_examples, 500)

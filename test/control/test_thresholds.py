@@ -8,7 +8,7 @@ import pytest
 
 from iwm_power_manager.control import settings, thresholds
 from iwm_power_manager.control.settings import Change
-from iwm_power_manager.control.thresholds import RECORDED, Thresholds, input_limits, supervision_limits
+from iwm_power_manager.control.thresholds import RECORDED, Thresholds, actuator_limits, input_limits, supervision_limits
 
 DIFFERENT = Thresholds(*(float(k + 1) for k in range(len(Thresholds._fields))))
 
@@ -35,6 +35,7 @@ def test_no_threshold_is_without_effect(name):
     same = (
         numbers_in(input_limits(changed, 0.3, True)) == numbers_in(input_limits(DIFFERENT, 0.3, True)),
         supervision_limits(changed) == supervision_limits(DIFFERENT),
+        actuator_limits(changed) == actuator_limits(DIFFERENT),
     )
     assert same.count(False) == (0 if name in stepping else 1)
 

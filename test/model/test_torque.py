@@ -61,7 +61,7 @@ def test_rounding_never_gives_an_axle_less_than_nothing():
 
 @given(st.floats(-400.0, 200.0), st.floats(0.0, 120.0), st.floats(0.0, 40.0), st.floats(0.0, 1.2))
 def test_motor_and_friction_brake_share_the_braking(torque, wheel, speed, heat):
-    motor, friction = blend(torque, wheel, speed, heat, CAR.front.motor)
+    motor, friction = blend(torque, wheel, speed, heat, 1.0, CAR.front.motor)
     if torque >= 0.0:
         assert (motor, friction) == (torque, 0.0)
         return

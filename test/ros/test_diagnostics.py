@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from iwm_power_manager.control.actuators import ActuatorState, Evidence, MotorVerdict
 from iwm_power_manager.control.inputs import Violation, WheelVerdict
 from iwm_power_manager.control.monitor import Tally
 from iwm_power_manager.control.supervision import (
@@ -24,6 +25,7 @@ from iwm_power_manager.ros.diagnostics import (
     LoopStatistics,
     Status,
     control_status,
+    motors_status,
     to_message,
 )
 
@@ -164,3 +166,13 @@ def test_a_change_is_told_once_and_not_too_often() -> None:
     assert changes.changed("b", 1.0)
     assert not changes.changed("c", 1.05)
     assert changes.changed("c", 1.2)
+
+
+def test_a_motor_that_does_not_follow_is_named():
+    motors = (Evidence(), Evidence(MotorVerdict.DEAD, 0.0), Evidence(MotorVerdict.WEAK, 0.5), Evidence())
+    status = motors_status(ActuatorState(motors=motors, reporting=True), ("fl", "fr", "rl", "rr"))
+    assert (status.level, status.message) == (ERROR, "motor fr is dead; motor rl is weak")
+    assert status.values["motor rl: counted on (%)"] == "50"
+    assert status.values["motor fl"] == "good"
+    quiet = motors_status(ActuatorState(), ("fl", "fr", "rl", "rr"))
+    assert (quiet.level, quiet.values["reported torque"]) == (OK, "none that follows the commands")

@@ -12,7 +12,7 @@ from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.thresholds import input_limits, supervision_limits
+from iwm_power_manager.control.thresholds import actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros import messages
 from iwm_power_manager.share import resolve
@@ -99,7 +99,10 @@ class TestLockstep:
         radius = vehicle.front.wheel.radius_m
         thresholds = config.thresholds_of(values)
         limits = ControllerLimits(
-            input_limits(thresholds, radius, by_clock=False), None, supervision_limits(thresholds)
+            input_limits(thresholds, radius, by_clock=False),
+            None,
+            supervision_limits(thresholds),
+            actuator_limits(thresholds),
         )
         twin = Controller(
             vehicle, messages.WHEEL_NAMES, limits, config.law_settings(values, "instantaneous_slip"), empty_table(), 0.9
