@@ -96,6 +96,8 @@ setup(
         # Only where no ROS 2 Jazzy is installed: the same rclpy and Fast DDS as wheels.
         "ros": ["ros-jazzy-common-interfaces", "ros-jazzy-rclpy[fastrtps]"],
         "test": ["pytest"],
+        # A DataFrame of a drive (`iwm_sim.api`).
+        "frame": ["pandas"],
         # The page of `watch_car`.
         "watch": ["bokeh"],
     },

@@ -42,6 +42,8 @@ ROSDEP_KEYS = {
     "yaml": "python3-yaml",
     "zstandard": "python3-rosbags-pip",
 }
+#: Used where they are installed; without them, one line says what to install.
+OPTIONAL = {"pandas"}
 #: What pip calls a module of another name.
 DISTRIBUTIONS = {"yaml": "pyyaml"}
 
@@ -79,7 +81,7 @@ def imports_of(path: Path) -> Iterator[str]:
 
 def third_party() -> set[str]:
     tops = {name.split(".")[0] for path in sources("iwm_power_manager", "iwm_sim") for name in imports_of(path)}
-    return {top for top in tops if top not in sys.stdlib_module_names and not top.startswith("iwm_")}
+    return {top for top in tops - OPTIONAL if top not in sys.stdlib_module_names and not top.startswith("iwm_")}
 
 
 def test_the_manifest_is_valid_and_names_ament_python(manifest: Package) -> None:
