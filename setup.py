@@ -23,6 +23,7 @@ EXECUTABLES = {
     "import_motor": "iwm_power_manager.executables:import_motor",
     "learn_policy": "iwm_sim.executables:learn_policy",
     "power_manager": "iwm_power_manager.executables:power_manager",
+    "precompile": "iwm_sim.executables:precompile",
     "recorder": "iwm_power_manager.executables:recorder",
     "replay": "iwm_power_manager.executables:replay",
     "set_parameter": "iwm_power_manager.executables:set_parameter",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+import time
 from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any, NamedTuple
@@ -27,11 +28,20 @@ STORE = Store()
 
 
 class Use(NamedTuple):
-    """An entry point that was needed: its full name, the file it is kept in, and whether that was found."""
+    """An entry point that was needed.
+
+    Attributes
+    ----------
+    kernel : its full name
+    file : what it is kept as
+    found : it had been compiled before
+    seconds : what loading or compiling it took
+    """
 
     kernel: str
     file: str
     found: bool
+    seconds: float
 
 
 #: Every entry point that this process has needed, in this order.
@@ -96,19 +106,24 @@ class _Cache(NullCache):
     def __init__(self, kernel: Kernel) -> None:
         self._kernel = kernel
         self._files: dict[Any, str | None] = {}
+        self._started_s: dict[Any, float] = {}
+
+    @property
+    def _name(self) -> str:
+        return f"{self._kernel.py_func.__module__}.{self._kernel.py_func.__qualname__}"
 
     def _file(self, signature: Any, context: Any) -> str | None:
         if signature not in self._files:
-            name = f"{self._kernel.py_func.__module__}.{self._kernel.py_func.__qualname__}"
             try:
                 key = key_of(self._kernel, signature, context.codegen().magic_tuple())
-                self._files[signature] = f"{name.replace('<', '').replace('>', '')}-{key}"
+                self._files[signature] = f"{self._name.replace('<', '').replace('>', '')}-{key}"
             except (UnknownSourceError, OSError, SyntaxError, UnicodeDecodeError):
                 self._files[signature] = None
         return self._files[signature]
 
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         """The compiled kernel for a signature, or None."""
+        self._started_s[sig] = time.perf_counter()
         target_context.refresh()
         file = self._file(sig, target_context)
         data = STORE.load(file) if file else None
@@ -118,11 +133,13 @@ class _Cache(NullCache):
                 result = CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301 whole, and our own
             except Exception:  # noqa: BLE001 whatever an unusable file makes of the loader
                 STORE.say_damaged(file)
-        USES.append(Use(repr(self._kernel), file or "", result is not None))
+        if result is not None:
+            USES.append(Use(self._name, file or "", True, time.perf_counter() - self._started_s[sig]))
         return result
 
     def save_overload(self, sig: Any, data: CompileResult) -> None:
         """Keep a compiled kernel, if it can be kept."""
         file = self._files.get(sig)
+        USES.append(Use(self._name, file or "", False, time.perf_counter() - self._started_s[sig]))
         if file and not data.library.has_dynamic_globals and all(lifted.can_cache for lifted in data.lifted):
             STORE.save(file, dumps(data._reduce()))

@@ -232,7 +232,8 @@ def measure(
     vehicle: VehicleParams,
 ) -> Measurement:
     """What the law is told about the car. State of charge goes through single precision, as in its ROS message."""
-    soc = float(np.float32(car.soc))
+    # Back to double precision for numba too, which would compile a law of its own for a single-precision charge.
+    soc = np.float64(np.float32(car.soc))
     discharge, charge = battery_limits_w(soc, BATTERY_TEMPERATURE_DEGC, vehicle.battery)
     w = car.wheel_speed_radps
     e = wheel_error_radps

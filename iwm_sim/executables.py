@@ -20,6 +20,11 @@ def learn_policy() -> int:
     return run("iwm_sim.tools.learn", INTERRUPTED)
 
 
+def precompile() -> int:
+    """Command `precompile`."""
+    return run("iwm_sim.tools.precompile", INTERRUPTED)
+
+
 def simulator() -> int:
     """Node `simulator`."""
     return run("iwm_sim.simulator", NODE_ENDED)

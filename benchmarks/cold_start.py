@@ -1,0 +1,79 @@
+"""Seconds from nothing to the first command: the control law's first step from an empty and from a full kernel cache.
+
+Each run is a process of its own: import, vehicle, policy, first step. `--peer FOLDER` runs another checkout beside it,
+in turns, so that both see the same machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+FIRST_STEP = """\
+import importlib
+from iwm_power_manager.control import law
+from iwm_power_manager.control.types import Measurement, initial_state
+from iwm_power_manager.model.limits import battery_limits_w
+from iwm_power_manager.policy import load_policy
+from iwm_power_manager.share import resolve
+from iwm_power_manager.vehicle import load_vehicle
+for name in ("settings", "types"):
+    try:
+        settings = importlib.import_module(f"iwm_power_manager.control.{name}").default_settings("sdp_lookahead")
+        break
+    except (ImportError, AttributeError):
+        pass
+params = load_vehicle(resolve("jalalmaab_2015")).params
+table = load_policy(resolve("jalalmaab_2015_drag_coupled_mu090")).table()
+discharge, charge = battery_limits_w(0.8, 25.0, params.battery)
+measurement = Measurement(1.0, (3.0,) * 4, 500.0, 0.01, 0.9, discharge, charge, 0.8)
+law.step(measurement, initial_state(), settings, params, table)
+"""
+
+
+def first_command_s(checkout: Path, cache: Path) -> tuple[float, float]:
+    """Seconds on the clock and of the processor until the law has answered once."""
+    environment = {**os.environ, "PYTHONPATH": str(checkout), "IWM_CACHE_DIR": str(cache)}
+    started, used = time.perf_counter(), os.times()
+    subprocess.run([sys.executable, "-c", FIRST_STEP], env=environment, check=True)
+    passed, after = time.perf_counter() - started, os.times()
+    return passed, after.children_user + after.children_system - used.children_user - used.children_system
+
+
+def main() -> None:
+    """Time cold and warm starts, print a line for each, and JSON if asked."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeat", type=int, default=3, help="runs of each (default: %(default)s)")
+    parser.add_argument("--peer", type=Path, metavar="FOLDER", help="another checkout, timed in turns")
+    parser.add_argument("--json", metavar="FILE", help="write all times")
+    options = parser.parse_args()
+    checkouts = {"this": ROOT} | ({"peer": options.peer.resolve()} if options.peer else {})
+    times: dict[str, dict[str, list[tuple[float, float]]]] = {name: {"cold": [], "warm": []} for name in checkouts}
+    for _ in range(options.repeat):
+        for name, checkout in checkouts.items():
+            with tempfile.TemporaryDirectory() as cache:
+                times[name]["cold"].append(first_command_s(checkout, Path(cache)))
+                times[name]["warm"].append(first_command_s(checkout, Path(cache)))
+    for name, kinds in times.items():
+        for kind, measured in kinds.items():
+            clock = [wall for wall, _ in measured]
+            processor = statistics.median(cpu for _, cpu in measured)
+            print(
+                f"{name:5} {kind}: {statistics.median(clock):6.2f} s to the first command "
+                f"({min(clock):.2f} to {max(clock):.2f}), {processor:.2f} s of the processor"
+            )
+    if options.json:
+        Path(options.json).write_text(json.dumps(times, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""Compile every kernel that the programs call, once, so that they start warm: the last step of an installation."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from iwm_power_manager.errors import IwmError
+
+#: Kernels of earlier versions that nobody has read for so long are removed, s.
+UNUSED_FOR_S = 60 * 86400.0
+
+Job = tuple[str, Callable[[], object]]
+
+
+def jobs() -> Iterator[Job]:
+    """What each program does first, in the smallest form, by name."""
+    import numpy as np
+
+    from iwm_power_manager.control import law
+    from iwm_power_manager.control.settings import default_settings
+    from iwm_power_manager.control.types import Measurement, initial_state
+    from iwm_power_manager.cycle import Cycle
+    from iwm_power_manager.mdp.demand import chain_of, cycle_source, driven_source
+    from iwm_power_manager.mdp.problem import problem_from
+    from iwm_power_manager.model.limits import battery_limits_w
+    from iwm_power_manager.policy import load_policy
+    from iwm_power_manager.share import resolve
+    from iwm_power_manager.solve import solve_one
+    from iwm_power_manager.vehicle import load_vehicle
+    from iwm_sim import closed_loop, preview
+    from iwm_sim.drive import Drive
+
+    vehicle = load_vehicle(resolve("jalalmaab_2015"))
+    speed = np.array([0.0, 1.0, 2.0, 1.0, 0.0, 0.0])
+    cycle = Cycle("precompile", np.arange(6.0), speed, np.zeros(6), "")
+    table = load_policy(resolve("jalalmaab_2015_drag_coupled_mu090")).table()
+    settings = default_settings()
+
+    def control_law() -> None:
+        discharge, charge = battery_limits_w(0.8, 25.0, vehicle.params.battery)
+        measurement = Measurement(1.0, (3.0, 3.0, 3.0, 3.0), 500.0, 0.01, 0.9, discharge, charge, 0.8)
+        law.step(measurement, initial_state(), settings, vehicle.params, table)
+
+    def simulated_car() -> None:
+        drive = Drive(vehicle, cycle, friction=0.9, initial_soc=0.8, dt_s=0.01, until_s=0.02)
+        drive.sense()
+        drive.advance((0.0,) * 4, drive.pedal_brake_torque_nm())
+
+    def closed_loop_run() -> closed_loop.Run:
+        return closed_loop.run(cycle, vehicle, settings, table, 0.9, until_s=0.1)
+
+    def schedule_known_ahead() -> None:
+        run = closed_loop_run()
+        share = table.share
+        preview.schedule(run["power_demand_w"], run["speed_mps"], 0.01, 0.1, vehicle.params, 0.9, share)
+
+    def solver() -> None:
+        problem = problem_from(_smallest_grid(), "precompile")
+        for source in (cycle_source(cycle, problem.dt_s, vehicle.params), driven_source(cycle, 0.1, vehicle.params)):
+            chain = chain_of(problem, [source])
+        with tempfile.TemporaryDirectory() as folder:
+            solve_one(problem, vehicle, 0.9, chain, [source], Path(folder) / "policy.npz")
+
+    yield "control law", control_law
+    yield "simulated car", simulated_car
+    yield "closed loop", closed_loop_run
+    yield "schedule known ahead", schedule_known_ahead
+    yield "solver", solver
+
+
+def _smallest_grid() -> dict[str, object]:
+    return {
+        "format": 1,
+        "power_w": [-1000, 0, 1000],
+        "speed_mps": [0, 2],
+        "slip_front": [0],
+        "slip_rear": [0],
+        "share": [0, 0.5, 1],
+        "previous_share": True,
+        "dt_s": 1.0,
+        "discount": 0.5,
+        "alpha": 20,
+        "power_error": "road",
+        "error_norm": "absolute",
+        "slip_model": "quasi_steady",
+        "skid_avoidance": "none",
+        "switching_cost_by_friction": [[0.9, 36]],
+        "demand_by_speed": True,
+        "cycle_demand": "driven",
+        "speed_bandwidth_mps": 1.0,
+        "prior_steps": 1,
+        "tolerance_j": 1.0,
+    }
+
+
+def parser() -> argparse.ArgumentParser:
+    """Options of `precompile`."""
+    made = argparse.ArgumentParser(
+        prog="precompile",
+        description="Compile the vehicle model, the control law and the solver once, so that every program starts "
+        "warm. The code is kept in ~/.cache/iwm_power_manager or, if it is set, in IWM_CACHE_DIR, which then has to "
+        "be the same where the programs run. Needed again after an update; what is compiled already is only looked up.",
+    )
+    made.add_argument("--json", action="store_true", help="list every entry point with its seconds, as JSON")
+    made.add_argument("--quiet", action="store_true", help="no progress bar")
+    return made
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compile everything; 0 when done, 1 if a shipped file it needs is unusable."""
+    options = parser().parse_args(arguments)
+    from tqdm import tqdm
+
+    from iwm_power_manager import compilation, kernel_cache
+
+    try:
+        work = list(jobs())
+        with tqdm(work, desc="compiling", unit="part", disable=options.quiet or None, file=sys.stderr) as bar:
+            for name, job in bar:
+                bar.set_postfix_str(name)
+                job()
+    except IwmError as error:
+        print(f"precompile: error: {error}", file=sys.stderr)
+        return 1
+    kernel_cache.prune(UNUSED_FOR_S)
+    if options.json:
+        print(json.dumps([use._asdict() for use in compilation.USES], indent=2))
+    else:
+        new = [use for use in compilation.USES if not use.found]
+        print(
+            f"{len(compilation.USES)} entry points are ready, {len(new)} of them compiled now "
+            f"({sum(use.seconds for use in new):.0f} s)"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
