@@ -22,21 +22,24 @@ FIRST_STEP = """\
 import importlib
 from iwm_power_manager.control import law
 from iwm_power_manager.control.types import Measurement, initial_state
-from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
-for name in ("settings", "types"):
-    try:
-        settings = importlib.import_module(f"iwm_power_manager.control.{name}").default_settings("sdp_lookahead")
-        break
-    except (ImportError, AttributeError):
-        pass
+
+def found(name, *modules):
+    for module in modules:  # where it stands now, and where it stood in earlier versions
+        try:
+            return getattr(importlib.import_module(f"iwm_power_manager.{module}"), name)
+        except (ImportError, AttributeError):
+            pass
+
+settings = found("default_settings", "control.settings", "control.types")("sdp_lookahead")
 params = load_vehicle(resolve("jalalmaab_2015")).params
 table = load_policy(resolve("jalalmaab_2015_drag_coupled_mu090")).table()
-discharge, charge = battery_limits_w(0.8, 25.0, params.battery)
+discharge, charge = found("battery_limits_w", "model.limits", "actuation.limits")(0.8, 25.0, params.battery)
 measurement = Measurement(1.0, (3.0,) * 4, 500.0, 0.01, 0.9, discharge, charge, 0.8)
 law.step(measurement, initial_state(), settings, params, table)
+print(law.__file__)
 """
 
 
@@ -44,7 +47,10 @@ def first_command_s(checkout: Path, cache: Path) -> tuple[float, float]:
     """Seconds on the clock and of the processor until the law has answered once."""
     environment = {**os.environ, "PYTHONPATH": str(checkout), "IWM_CACHE_DIR": str(cache)}
     started, used = time.perf_counter(), os.times()
-    subprocess.run([sys.executable, "-c", FIRST_STEP], env=environment, check=True)
+    command = [sys.executable, "-P", "-c", FIRST_STEP]
+    done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+    if not Path(done.stdout.strip()).is_relative_to(checkout):
+        raise SystemExit(f"{checkout} was not what ran: {done.stdout.strip()}")
     passed, after = time.perf_counter() - started, os.times()
     return passed, after.children_user + after.children_system - used.children_user - used.children_system
 

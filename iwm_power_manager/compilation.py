@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import pickle
 import time
@@ -12,10 +13,12 @@ from typing import Any, NamedTuple
 import numba
 from numba.core import config
 from numba.core.caching import NullCache
-from numba.core.compiler import CompileResult
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 from numba.core.types.containers import BaseNamedTuple, BaseTuple
+from numba.core.types.misc import unliteral
 
 from iwm_power_manager import kernel_cache
 from iwm_power_manager.jit import Kernel
@@ -52,14 +55,66 @@ def _options(kernel: Kernel) -> dict[str, Any]:
     return {"nopython": True, "error_model": "numpy", "nogil": kernel.releases_lock}
 
 
+class _Code(JITCodeLibrary):
+    """Code that is only linked into other code: optimised there, once, and no machine code of its own."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _PartCompiler(Compiler):
+    """Numba's compiler, up to the code that is linked into the caller."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, names: Any) -> None:
+        flags.no_compile = True
+        super().__init__(typing, target, library or _Code(target.codegen(), "part"), args, result, flags, names)
+
+
+class _Part(CPUDispatcher):
+    """A kernel as other kernels call it."""
+
+    def get_call_template(self, arguments: Any, names: Any) -> Any:
+        """As numba's, but True and False, 1 and 2 are one type each: no copy of the kernel for every literal."""
+        _, arguments = self._compiler.fold_argument_types(arguments, names)
+        return super().get_call_template(tuple(unliteral(kind) for kind in arguments), {})
+
+    def add_overload(self, result: CompileResult) -> None:
+        """Let callers find what was compiled; there is nothing that Python could call."""
+        result = result._replace(entry_point=_EntryPoint())
+        self.targetctx.insert_user_function(result.entry_point, result.fndesc, [result.library])
+        self.overloads[tuple(result.signature.args)] = result
+
+
+class _EntryPoint:
+    """Stands for the address that a part does not have."""
+
+
 def part(kernel: Kernel) -> CPUDispatcher:
     """A kernel as other kernels call it."""
-    return CPUDispatcher(kernel.py_func, targetoptions=_options(kernel) | _NO_WRAPPERS)
+    return _Part(kernel.py_func, targetoptions=_options(kernel) | _NO_WRAPPERS, pipeline_class=_PartCompiler)
+
+
+class _Entry(CPUDispatcher):
+    """A kernel as Python calls it."""
+
+    def compile(self, signature: Any) -> Any:
+        """Find or compile it for a signature; the compiler makes no garbage worth looking for meanwhile."""
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return super().compile(signature)
+        finally:
+            if collecting:
+                gc.enable()
 
 
 def entry_point(kernel: Kernel) -> CPUDispatcher:
     """A kernel as Python calls it."""
-    dispatcher = CPUDispatcher(kernel.py_func, targetoptions=_options(kernel) | {"no_cfunc_wrapper": True})
+    dispatcher = _Entry(kernel.py_func, targetoptions=_options(kernel) | {"no_cfunc_wrapper": True})
     dispatcher._cache = _Cache(kernel)
     return dispatcher
 
