@@ -34,6 +34,7 @@ def jobs() -> Iterator[Job]:
     from iwm_power_manager.vehicle import load_vehicle
     from iwm_sim import closed_loop, preview
     from iwm_sim.drive import Drive
+    from iwm_sim.scenario import on_cycle
 
     vehicle = load_vehicle(resolve("jalalmaab_2015"))
     speed = np.array([0.0, 1.0, 2.0, 1.0, 0.0, 0.0])
@@ -47,7 +48,7 @@ def jobs() -> Iterator[Job]:
         law.step(measurement, initial_state(), settings, vehicle.params, table)
 
     def simulated_car() -> None:
-        drive = Drive(vehicle, cycle, friction=0.9, initial_soc=0.8, dt_s=0.01, until_s=0.02)
+        drive = Drive(on_cycle(vehicle, cycle, 0.9), dt_s=0.01)
         drive.sense()
         drive.advance((0.0,) * 4, drive.pedal_brake_torque_nm())
 
