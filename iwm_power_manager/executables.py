@@ -1,7 +1,8 @@
 """What the installed commands run.
 
 To import compiled libraries takes seconds, and Ctrl-C would end that in a traceback from wherever it was. So a command
-imports its module here, and until that is done Ctrl-C ends the process on the spot.
+imports its module here, and until that is done Ctrl-C ends the process on the spot. What a command needs for its work
+but not for `--help`, it names in `NEEDS` and imports where it is used: `--help` then answers at once.
 """
 
 from __future__ import annotations
@@ -9,11 +10,14 @@ from __future__ import annotations
 import importlib
 import os
 import signal
+import sys
 
 #: Ctrl-C is how a node is ended: `ros2 launch` reports every other code as a crash.
 NODE_ENDED = 0
 #: What a shell makes of a command that Ctrl-C has ended.
 INTERRUPTED = 130
+#: Options that are answered without what the work needs.
+ASK_ONLY = frozenset({"-h", "--help", "--version"})
 
 
 def run(module: str, interrupted: int) -> int:
@@ -32,7 +36,11 @@ def run(module: str, interrupted: int) -> int:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored, as under nohup
         # No exception: libraries make something else of one that meets them half imported.
         signal.signal(signal.SIGINT, lambda *_: os._exit(interrupted))
-    main = importlib.import_module(module).main
+    command = importlib.import_module(module)
+    if not ASK_ONLY.intersection(sys.argv[1:]):
+        for name in getattr(command, "NEEDS", ()):
+            importlib.import_module(name)
+    main = command.main
     try:
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
             signal.signal(signal.SIGINT, signal.default_int_handler)

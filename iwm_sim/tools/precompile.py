@@ -11,6 +11,9 @@ from pathlib import Path
 
 from iwm_power_manager.errors import IwmError
 
+#: What the work needs, but `--help` does not.
+NEEDS = ("iwm_power_manager.compilation", "iwm_power_manager.solve", "iwm_sim.drive", "iwm_sim.preview", "tqdm")
+
 #: Kernels of earlier versions that nobody has read for so long are removed, s.
 UNUSED_FOR_S = 60 * 86400.0
 
