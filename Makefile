@@ -63,8 +63,9 @@ mutation: setup-dev  ## Mutate the same modules: do the tests notice?
 
 ##@ Parts
 .PHONY: lint type format sbom build clean setup-run setup-dev help
-lint: setup-dev  ## ruff: style, docstrings, likely mistakes
+lint: setup-dev  ## ruff: style, docstrings, likely mistakes; import-linter: the layers
 	@$(BIN)/ruff check .
+	@$(BIN)/lint-imports --no-logo 2> /dev/null || $(BIN)/lint-imports
 
 type: setup-dev  ## mypy, strict
 	@$(BIN)/mypy

@@ -40,7 +40,6 @@ from iwm_power_manager.replay.demand import drive_source, read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
 from iwm_power_manager.tools.options import several
-from iwm_power_manager.tools.solver_figures import draw_solution
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
 SOLVED, UNSOLVED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -169,6 +168,8 @@ def _solve(options: argparse.Namespace) -> int:
             solved.append(solve_one(problem, vehicle, friction, chain, sources, path, progress.update))
         say(_convergence_text(solved[-1]))
     if options.plot:
+        from iwm_power_manager.tools.solver_figures import draw_solution
+
         draw_solution([result.policy for result in solved], Path(options.plot))
         say(f"picture: {options.plot}")
     if options.json:
