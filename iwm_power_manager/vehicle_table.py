@@ -169,3 +169,18 @@ ORDERED: dict[str, tuple[tuple[str, str, bool], ...]] = {
         ("power_full_below_degc", "power_zero_above_degc", False),
     ),
 }
+
+
+def markdown() -> str:
+    """The table as docs/vehicle.md has it."""
+    lines = [
+        "| key | unit | allowed | meaning | if it is missing | a policy depends on it |",
+        "|---|---|---|---|---|---|",
+    ]
+    for section, table in TABLE.items():
+        for key, q in table.items():
+            where = {"axle": key, "loss": f"motor.loss.{key}"}.get(section, f"{section}.{key}")
+            low = f"above {q.low:g}" if q.above else f"{q.low:g}"
+            policy = "yes" if q.decides else ""
+            lines.append(f"| `{where}` | {q.unit} | {low} to {q.high:g} | {q.meaning} | {q.default} | {policy} |")
+    return "\n".join(lines) + "\n"

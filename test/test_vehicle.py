@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import copy
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from iwm_power_manager import files, vehicle
+from iwm_power_manager import files, vehicle, vehicle_table
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.motor import electrical_power_w, enabled_loss_w, idle_drag_nm
 from iwm_power_manager.share import share_path
@@ -439,6 +440,12 @@ def test_a_map_s_path_is_seen_from_the_vehicle_file(tmp_path):
     (tmp_path / "map.csv").unlink()
     with pytest.raises(ConfigError, match=r"map\.csv: cannot be read"):
         load_vehicle(tmp_path / "cars" / "car.yaml")
+
+
+def test_the_page_has_the_table():
+    page = (Path(__file__).resolve().parents[1] / "docs" / "vehicle.md").read_text()
+    table = page.split("<!-- table -->\n")[1].split("<!-- end -->")[0]
+    assert table == vehicle_table.markdown(), "write vehicle_table.markdown() to docs/vehicle.md"
 
 
 # --- Numbers that do not fit each other ------------------------------------------------------------------------------

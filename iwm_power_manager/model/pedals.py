@@ -1,6 +1,6 @@
 """What the driver's wish means as power at the wheels, however it is said (docs/model.md, docs/connect.md).
 
-    accelerator a:  P = a * P_max(v),   P_max = min(4 T_peak w, 4 P_motor),  w = v / r
+    accelerator a:  P = a * P_max(v),   P_max = sum over the four motors of min(T_peak w, P_motor),  w = v / r
     brake b:        P = -b * k m g v
 
     wheel force F:  P = F * v,   torque T over all wheels:  P = T * v / r,   acceleration a:  P = (m_eq a + F_road) * v
@@ -22,9 +22,11 @@ PEDAL_TRAVEL, FORCE, TORQUE, ACCELERATION = range(4)
 @kernel
 def full_power_w(speed_mps: float, vehicle: VehicleParams) -> float:
     """Power of the fully pressed accelerator, W."""
-    motor = vehicle.front.motor
-    wheel_speed = max(speed_mps, vehicle.driver.power_speed_floor_mps) / vehicle.front.wheel.radius_m
-    return 4.0 * min(motor.peak_torque_nm * wheel_speed, motor.max_power_w)
+    speed = max(speed_mps, vehicle.driver.power_speed_floor_mps)
+    front, rear = vehicle.front, vehicle.rear
+    of_front = min(front.motor.peak_torque_nm * (speed / front.wheel.radius_m), front.motor.max_power_w)
+    of_rear = min(rear.motor.peak_torque_nm * (speed / rear.wheel.radius_m), rear.motor.max_power_w)
+    return 2.0 * (of_front + of_rear)
 
 
 @kernel
@@ -50,8 +52,12 @@ def force_power_w(force_n: float, speed_mps: float, vehicle: VehicleParams) -> f
 
 @kernel
 def torque_power_w(torque_nm: float, speed_mps: float, vehicle: VehicleParams) -> float:
-    """Power of a torque, the sum over the four wheels, W; braking negative. At rest the torque is what the car gets."""
-    return force_power_w(torque_nm / vehicle.front.wheel.radius_m, speed_mps, vehicle)
+    """Power of a torque, the sum over the four wheels, W; braking negative. At rest the torque is what the car gets.
+
+    Where the axles' wheels differ in size, half of it counts for each axle.
+    """
+    force = 0.5 * (torque_nm / vehicle.front.wheel.radius_m + torque_nm / vehicle.rear.wheel.radius_m)
+    return force_power_w(force, speed_mps, vehicle)
 
 
 @kernel
