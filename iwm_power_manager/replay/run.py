@@ -218,7 +218,9 @@ class Replay:
             self._bad_messages += 1
             return []
         names, values = recorded.names, recorded.values
-        if kind == STATE:
+        if kind == STATE and list(names) == SIGNAL_NAMES:
+            names, values = DECIDED_NAMES, values[_FIRST_DECIDED : _FIRST_DECIDED + len(DECIDED_NAMES)]
+        elif kind == STATE:
             found = YOUNGER_SIGNALS | dict(zip(names, values, strict=True))
             names, values = DECIDED_NAMES, tuple(found.get(name, math.nan) for name in DECIDED_NAMES)
         self._comparers[kind].recorded(recorded.stamp_ns, message.log_time_ns, names, values)
