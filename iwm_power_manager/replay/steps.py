@@ -20,7 +20,7 @@ from iwm_power_manager.control.monitor import (
     JointReading,
     SpeedReading,
 )
-from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, decided, from_numbers
+from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS, decided, from_numbers
 from iwm_power_manager.control.stepping import AsRecorded, Lockstep, Taken
 from iwm_power_manager.control.thresholds import RECORDED, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.control.types import Command, ControllerState, initial_state
@@ -83,7 +83,7 @@ class RecordedSteps:
 
     def take(self, recorded: NamedValues, log_time_ns: int, publish_time_ns: int) -> ReplayedStep | None:
         """Repeat one step; `KeyError` if the message is of another kind or version."""
-        values = dict(zip(recorded.names, recorded.values, strict=True))
+        values = YOUNGER_SIGNALS | dict(zip(recorded.names, recorded.values, strict=True))
         number = int(values["step"])
         last = self._last
         if last is not None and last.stamp_ns == recorded.stamp_ns and last.before.steps == number:

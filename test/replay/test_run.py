@@ -14,15 +14,17 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from bags_helpers import TWIST, ScriptedDrive, float64, topic, twist
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter
+from iwm_power_manager.control.record import SIGNAL_NAMES, YOUNGER_SIGNALS
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.policy import load_policy, save_policy
 from iwm_power_manager.replay.compare import TopicComparer
 from iwm_power_manager.replay.plan import Choice, make_plan, recorded_parameters
-from iwm_power_manager.replay.run import Replay
+from iwm_power_manager.replay.run import STATE, Replay
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.mapping import load_mapping
+from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import standard_types
 from iwm_power_manager.tools.replay import BAD_INPUT, DIFFERENT, DONE, main
 
@@ -121,6 +123,22 @@ def test_a_changed_policy_is_caught_and_the_same_one_matches(
         assert main([str(drive), "--compare", *arguments]) == wanted, name
         text = capsys.readouterr().out
         assert ("first at message" in text) == (wanted == DIFFERENT), name
+
+
+def test_a_bag_of_before_a_signal_was_added_is_replayed(drive: Path, tmp_path: Path) -> None:
+    read = joint_state_reader("position")
+    names = [name for name in SIGNAL_NAMES if name not in YOUNGER_SIGNALS]
+    write = joint_state_writer(names, "position")
+    with BagReader(drive) as old, BagWriter(tmp_path / "old", custom_data=old.custom_data) as new:
+        numbers = {name: new.add_topic(found) for name, found in old.topics.items()}
+        for message in old.messages():
+            data = message.data
+            if message.topic.endswith(STATE):
+                recorded = read(data)
+                values = dict(zip(recorded.names, recorded.values, strict=True))
+                data = write(recorded.stamp_ns, [values[name] for name in names])
+            new.write(numbers[message.topic], message.log_time_ns, data, message.publish_time_ns, message.sequence)
+    assert main([str(tmp_path / "old"), "--compare"]) == DONE
 
 
 def test_a_policy_changed_in_its_place_is_caught(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -119,9 +119,7 @@ def test_demos_at_the_same_time_have_different_domains(tmp_path, monkeypatch):
 
 
 def test_the_closed_loop_gets_the_settings_the_power_managers_file_gives(monkeypatch):
-    monkeypatch.setattr(
-        dds_drive.files, "read_yaml", lambda _: {"/**": {"ros__parameters": {"critical_slip": 0.3}}}
-    )
+    monkeypatch.setattr(dds_drive.files, "read_yaml", lambda _: {"/**": {"ros__parameters": {"critical_slip": 0.3}}})
     values = dds_drive.power_manager_parameters()
     assert power_manager_config.law_settings(values, "equal").critical_slip == 0.3
     assert values["rate_hz"] == 100.0
