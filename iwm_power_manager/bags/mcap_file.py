@@ -81,7 +81,8 @@ class McapFile:
         self.start_time_ns = 0
         self.end_time_ns = 0
         self.channel_counts: dict[int, int] = {}
-        self._pending: list[tuple[int, int]] = []  # channel and log time
+        self._pending: list[int] = []  # the messages' channels
+        self._times: list[int] = []  # and log times
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self.broken = False
         self._buffer = _Buffer()
@@ -144,7 +145,8 @@ class McapFile:
     def write(self, channel: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes) -> None:
         """Add a message to the chunk in memory; all numbers >= 0."""
         self._add(channel, log_time_ns, data, publish_time_ns, sequence)
-        self._pending.append((channel, log_time_ns))
+        self._pending.append(channel)
+        self._times.append(log_time_ns)
         if self._pieces:  # the writer has closed a chunk
             self._take_up()
 
@@ -158,13 +160,13 @@ class McapFile:
 
     def _take_up(self) -> None:
         """Bring a closed chunk into the file, and count its messages."""
-        pending, self._pending = self._pending, []
+        pending, times = self._pending, self._times
+        self._pending, self._times = [], []
         self._push()
-        start_ns, end_ns = min(time for _, time in pending), max(time for _, time in pending)
-        self.start_time_ns = min(self.start_time_ns, start_ns) if self.message_count else start_ns
-        self.end_time_ns = max(self.end_time_ns, end_ns)
+        self.start_time_ns = min(times) if not self.message_count else min(self.start_time_ns, min(times))
+        self.end_time_ns = max(self.end_time_ns, max(times))
         self.message_count += len(pending)
-        for channel, count in Counter(channel for channel, _ in pending).items():
+        for channel, count in Counter(pending).items():
             self.channel_counts[channel] += count
         if os.fstat(self._stream.fileno()).st_nlink == 0:
             raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")

@@ -165,20 +165,29 @@ class BagWriter:
         publish_time_ns : when it was sent; None for the log time
         sequence : the publisher's counter, 0 if unknown
         """
-        if len(data) > self._largest:
-            raise MessageTooLarge(
-                f"{self.path}: {self._topics[topic].name}: a message of {len(data)} bytes was not written; "
-                f"allowed: <= {self._largest}"
-            )
-        if self._splits or not self._file_has_message:
-            self._split_if_due(log_time_ns, len(data))
-        if publish_time_ns is None:
-            publish_time_ns = log_time_ns
-        file = self._file or self._open
+        file = self._file
+        if len(data) > self._largest or self._splits or not self._file_has_message or file is None:
+            file = self._prepared(topic, log_time_ns, len(data))
         try:
-            file.write(self._channels[topic], log_time_ns, publish_time_ns, sequence & 0xFFFFFFFF, data)
+            file.write(
+                self._channels[topic],
+                log_time_ns,
+                log_time_ns if publish_time_ns is None else publish_time_ns,
+                sequence & 0xFFFFFFFF,
+                data,
+            )
         except OSError as error:
             raise self._failed(error) from None
+
+    def _prepared(self, topic: int, log_time_ns: int, size: int) -> McapFile:
+        """The file for a message of this size, if it is not too large."""
+        if size > self._largest:
+            raise MessageTooLarge(
+                f"{self.path}: {self._topics[topic].name}: a message of {size} bytes was not written; "
+                f"allowed: <= {self._largest}"
+            )
+        self._split_if_due(log_time_ns, size)
+        return self._open
 
     def _split_if_due(self, log_time_ns: int, size: int) -> None:
         """Begin the next file, if the present one is full or old enough."""

@@ -21,6 +21,7 @@ from iwm_power_manager.control.monitor import (
     SpeedReading,
 )
 from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS, decided, from_numbers
+from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.stepping import AsRecorded, Lockstep, Taken
 from iwm_power_manager.control.thresholds import RECORDED, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.control.types import Command, ControllerState, initial_state
@@ -80,6 +81,8 @@ class RecordedSteps:
         self._state = initial_state()
         self._next = 0
         self._last: ReplayedStep | None = None
+        self._settings: Settings | None = None
+        self._setting_values: dict[str, float] = {}
 
     def take(self, recorded: NamedValues, log_time_ns: int, publish_time_ns: int) -> ReplayedStep | None:
         """Repeat one step; `KeyError` if the message is of another kind or version."""
@@ -109,7 +112,10 @@ class RecordedSteps:
             self.faults[problem] += 1
             return None
         values.update(zip(DECIDED_NAMES, map(float, decided(command, before, after)), strict=True))
-        values.update({f"setting.{name}": float(value) for name, value in settings._asdict().items()})
+        if settings != self._settings:  # they rarely change
+            self._settings = settings
+            self._setting_values = {f"setting.{name}": float(value) for name, value in settings._asdict().items()}
+        values.update(self._setting_values)
         values["friction"] = measurement.friction
         self._last = ReplayedStep(
             recorded.stamp_ns,
