@@ -11,6 +11,8 @@ import re
 from collections.abc import Callable
 
 from iwm_power_manager.control.settings import DEFAULTS
+from iwm_power_manager.policy import load_policy
+from iwm_power_manager.share import share_path
 from iwm_sim.study import labels, paper
 from iwm_sim.study.answers import answers, savings
 from iwm_sim.study.content import Study
@@ -111,9 +113,22 @@ def by_friction(study: Study) -> str:
     return f"Our mean saving over the cycles, by friction: {'; '.join(parts)}."
 
 
+def policies(study: Study) -> str:
+    """Whether the stored numbers are those of the shipped policies."""
+    driven = {policy.checksum for policy in study.policies[labels.OURS]}
+    shipped = {load_policy(path).checksum for path in sorted(share_path("policies").glob("*.npz"))}
+    if driven <= shipped:
+        return "These numbers were driven with the shipped policies."
+    return (
+        "**The shipped policies are newer than these numbers**, which were driven with those whose checksums stand in "
+        "`docs/study.json`; `make study` drives the shipped ones."
+    )
+
+
 BLOCKS: dict[str, Callable[[Study], str]] = {
     "savings": savings_table,
     "summary": summary,
     "energy": energy,
     "by friction": by_friction,
+    "policies": policies,
 }
