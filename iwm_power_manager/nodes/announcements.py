@@ -59,9 +59,7 @@ class Announcements:
     def preparing(self, elapsed_s: float) -> None:
         """Tell that it takes long, again and again."""
         if elapsed_s > COMPILING_S and self._due("compiling"):
-            self._logger.info(
-                f"preparing for {elapsed_s:.0f} s so far: what the cache does not hold is compiled"
-            )
+            self._logger.info(f"preparing for {elapsed_s:.0f} s so far: what the cache does not hold is compiled")
 
     def prepared(self, prepared: Prepared) -> None:
         """Tell what was loaded."""

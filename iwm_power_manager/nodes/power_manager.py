@@ -51,7 +51,13 @@ from iwm_power_manager.signals.cdr import MessageWriter
 from iwm_power_manager.signals.commands import FRICTION, MOTOR, CommandWriter
 from iwm_power_manager.signals.contract import JOINT_STATE, NODE_STATE
 from iwm_power_manager.signals.mapping import DEMANDS, PEDALS
-from iwm_power_manager.signals.readings import DemandReading, FrictionReading, TopicReader, joint_state_writer
+from iwm_power_manager.signals.readings import (
+    DemandReading,
+    FrictionReading,
+    TopicReader,
+    TorqueReading,
+    joint_state_writer,
+)
 
 #: The queue of each stamped input of a lock-step set.
 _QUEUES: dict[type, int] = {SpeedReading: SPEED, JointReading: WHEELS, BatteryReading: BATTERY}
@@ -393,6 +399,8 @@ class PowerManager(KeepsItsValues, LifecycleNode):
             monitor.take_demand(reading.power_w, (now_ns - reading.stamp_ns) / _NS_PER_S, now_ns)
         elif kind is FrictionReading:
             monitor.take_friction(reading.friction, now_ns)
+        elif kind is TorqueReading:
+            monitor.take_torques(reading)
 
     def _on_demand(self, data: bytes, info: dict[str, Any]) -> None:
         """Lock-step: the demand closes a set."""

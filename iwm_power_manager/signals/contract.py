@@ -73,7 +73,7 @@ TOPICS = (
         JOINT_STATE,
         "in",
         _CAR,
-        "`velocity`: wheel speeds by `name`, rad/s, forwards positive",
+        "`velocity`: wheel speeds by `name`, rad/s, forwards positive; `effort`: torques that the motors report, N m",
         "100 Hz",
         "best_effort",
         "motor torque fades to zero, friction brakes follow the demand",

@@ -220,6 +220,7 @@ class Bench:
         soc: float = 0.5,
         temperature: float = 25.0,
         stamp_ns: int | None = None,
+        torques: tuple[float, ...] = (),
         names: tuple[str, ...] = messages.WHEEL_NAMES,
         without: tuple[str, ...] = (),
     ) -> int:
@@ -228,7 +229,7 @@ class Bench:
         wheels = (speed / 0.33,) * 4 if wheels is None else wheels
         set_of_inputs = {
             messages.VEHICLE_SPEED: messages.vehicle_speed_message(stamp, speed),
-            messages.WHEEL_STATES: messages.wheel_states_message(stamp, names, wheels, (0.0,) * len(wheels)),
+            messages.WHEEL_STATES: messages.wheel_states_message(stamp, names, wheels, torques or (0.0,) * len(wheels)),
             messages.BATTERY_STATE: messages.battery_state_message(
                 stamp, soc=soc, voltage_v=237.0, discharge_current_a=10.0, temperature_c=temperature
             ),

@@ -75,7 +75,7 @@ def test_a_file_that_cannot_be_gone_on_from_refuses_to_configure_and_stays_as_it
     assert f"{path}: was counted on the axes of another policy; choose another file" in lockstep.running.text()
     path.write_bytes(b"nothing")
     assert not bench.change_state("configure")
-    assert f"{path}: is no file of demand transitions, or a damaged one" in lockstep.running.text()
+    assert f"{path}: is no file of demand transitions" in lockstep.running.text()
     assert path.read_bytes() == b"nothing"
     path.write_bytes(content)
     assert bench.set_parameter("demand_log", str(folder / "none" / "demand.npz")) == ""

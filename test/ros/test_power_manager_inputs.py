@@ -155,7 +155,8 @@ class TestDiagnostics:
         bench.drive(lambda: len(bench.diagnostics) >= 2, "reports")
         full_name = f"{bench.node.get_namespace()}/power_manager"
         assert {status.name for status in bench.diagnostics[-1].status} == {
-            f"{full_name}: {name}" for name in ("control", "inputs", "control loop", "policy", "command topics")
+            f"{full_name}: {name}"
+            for name in ("control", "inputs", "motors", "control loop", "policy", "command topics")
         }
         assert {status.hardware_id for status in bench.diagnostics[-1].status} == {full_name}
         for name in ("control", "inputs", "policy", "command topics"):
@@ -203,6 +204,25 @@ class TestDiagnostics:
             lambda: bench.status("input topics") and "power_demand" in bench.status("input topics").message, "the error"
         )
         bench.node.destroy_publisher(weak)
+
+
+def test_a_motor_that_reports_no_torque_is_found_and_left_out(start_pair) -> None:
+    bench = start_pair().bench
+    dead: set[int] = set()
+
+    def follow() -> tuple[float, ...]:
+        """Report the torques that were commanded last, but for dead motors; returns what was commanded."""
+        last = tuple(bench.torques[-1].effort) if bench.torques else (0.0,) * 4
+        bench.send(torques=tuple(0.0 if i in dead else torque for i, torque in enumerate(last)))
+        return last
+
+    bench.connect()
+    bench.drive(lambda: min(follow()) > 30.0 and bench.mode() == 1, "torque that all motors report")
+    assert bench.status("motors").level == DiagnosticStatus.OK
+    dead.add(2)
+    bench.drive(lambda: follow()[2] == 0.0, "the end of the dead motor's command")
+    bench.drive(lambda: follow() and bench.status("motors").level != DiagnosticStatus.OK, "the reason")
+    assert "rear_left" in bench.status("motors").message
 
 
 class TestParameters:

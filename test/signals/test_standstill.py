@@ -12,7 +12,7 @@ from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.thresholds import RECORDED, input_limits, supervision_limits
+from iwm_power_manager.control.thresholds import RECORDED, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.pedals import full_braking_w, full_power_w
 from iwm_power_manager.ros import messages
@@ -33,7 +33,9 @@ def wheel_force_n(tmp_path: Path, signal: str, unit: str, value: float, speed_mp
     """Force over all wheels that the power manager settles on, motors and brakes."""
     path = tmp_path / "signals.yaml"
     path.write_text(f"signals: {{{signal}: {{topic: d, field: data, unit: {unit}}}}}")
-    limits = ControllerLimits(input_limits(RECORDED, RADIUS_M, by_clock=False), None, supervision_limits(RECORDED))
+    limits = ControllerLimits(
+        input_limits(RECORDED, RADIUS_M, by_clock=False), None, supervision_limits(RECORDED), actuator_limits(RECORDED)
+    )
     controller = Controller(CAR, WHEEL_NAMES, limits, default_settings("equal"), empty_table(), 0.9)
     monitor = controller.monitor
     assembly = Assembly(WHEEL_NAMES, CAR, lambda: monitor.speed_mps)
