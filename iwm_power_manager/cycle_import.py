@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from iwm_power_manager.cycle import MAX_GRADE, Cycle, at_rest, make_cycle
+from iwm_power_manager.cycle import MAX_GRADE, MAX_SAMPLES, Cycle, at_rest, make_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.tables import Table, read_table
 from iwm_power_manager.trace_units import SPEED_UNITS, TIME_UNITS, FloatArray, implausible, likely_units
@@ -18,6 +18,7 @@ from iwm_power_manager.trace_units import SPEED_UNITS, TIME_UNITS, FloatArray, i
 GAPS = ("refuse", "bridge", "cut")
 #: At a cut, the speed goes from one piece's end to the next one's start at this, m/s2.
 JOINT_MPS2 = 1.0
+_SHORTEST_STEP_S = 1e-4
 #: A log that shows more than this below zero drives backwards, or has another sign.
 _BACKWARDS_MPS = 0.5
 _UNIT_NAMES = {
@@ -239,9 +240,12 @@ def to_cycle(log: Log, gaps: str, max_gap_s: float, smooth_s: float, rate_hz: fl
         time = _without_gaps(time, speed, max_gap_s, log.step_s)
     if smooth_s > 0.0 or rate_hz > 0.0:
         step = 1.0 / rate_hz if rate_hz > 0.0 else log.step_s
-        even: FloatArray = np.arange(int((time[-1] - time[0]) / step + 1e-9) + 1) * np.float64(step)
         # Smoothed at the log's own pace: fewer samples would alias what the smoothing is to remove.
         fine_step = min(step, log.step_s)
+        if fine_step < _SHORTEST_STEP_S or (time[-1] - time[0]) / fine_step > MAX_SAMPLES:
+            problem = f"lasts {time[-1] - time[0]:.4g} s with samples {fine_step:.2g} s apart"
+            raise ConfigError(log.name, "", problem, f"{MAX_SAMPLES} samples, {_SHORTEST_STEP_S:g} s apart or more")
+        even: FloatArray = np.arange(int((time[-1] - time[0]) / step + 1e-9) + 1) * np.float64(step)
         fine = np.arange(int((time[-1] - time[0]) / fine_step + 1e-9) + 1) * fine_step
         smoothed = _smoothed(np.interp(fine, time, speed), smooth_s / fine_step)
         speed, grade = np.interp(even, fine, smoothed), np.interp(even, time, grade)

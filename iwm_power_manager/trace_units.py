@@ -19,7 +19,7 @@ MAX_DECELERATION_MPS2 = 13.0
 #: A car that goes through a range of speeds does so faster than this at least once.
 MIN_ACCELERATION_MPS2 = 0.02
 _MIN_SAMPLES, _MIN_SPEED_RANGE_MPS = 10, 3.0
-_WINDOW_S = 1.0
+_WINDOW_S, _SHORTEST_S = 1.0, 1e-3
 #: What driving looks like, m/s2: the harder of acceleration and braking is more than this, and neither beyond its own.
 _USUAL_LOW, _USUAL_RISE, _USUAL_FALL = 0.3, 5.0, 9.0
 _MAX_SPEED_MPS = 70.0
@@ -43,9 +43,9 @@ class Steepest(NamedTuple):
 def steepest(time_s: FloatArray, speed_mps: FloatArray) -> Steepest:
     """The hardest acceleration and braking of a trace of two points or more, times rising."""
     span = time_s[-1] - time_s[0]
-    window = min(_WINDOW_S, span)
+    window = max(min(_WINDOW_S, span), _SHORTEST_S)
     # A window from every sample; what lies behind the end counts up to the end.
-    start = np.minimum(time_s, time_s[-1] - window)
+    start = np.minimum(time_s, time_s[-1] - min(window, span))
     change = np.interp(start + window, time_s, speed_mps) - np.interp(start, time_s, speed_mps)
     rate = change / window
     up, down = int(np.argmax(rate)), int(np.argmin(rate))
