@@ -30,6 +30,7 @@ from iwm_power_manager.mdp.demand import (
     source_of,
 )
 from iwm_power_manager.mdp.demand_counts import transitions_source
+from iwm_power_manager.mdp.export import export_mdp
 from iwm_power_manager.mdp.policy_iteration import Iteration
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.mdp.transitions import build_model
@@ -125,6 +126,9 @@ def parser() -> argparse.ArgumentParser:
     output.add_argument("--output", metavar="DIR|FILE", help="folder for the policies, or a .npz file for a single one")
     output.add_argument("--plot", metavar="PNG", help="picture of transition matrix, convergence and policy")
     output.add_argument("--json", metavar="FILE", help="the run's numbers")
+    output.add_argument(
+        "--export-mdp", metavar="NPZ", help="the exact problem, for another solver (one friction; docs/solver.md)"
+    )
     output.add_argument("--quiet", action="store_true", help="print errors only")
     output.add_argument("--check", nargs="+", metavar="POLICY", help="verify policy files instead of solving")
     output.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
@@ -167,6 +171,10 @@ def _solve(options: argparse.Namespace) -> int:
         with _Progress(f"friction {friction:g}", problem.tolerance_j, options.quiet) as progress:
             solved.append(solve_one(problem, vehicle, friction, chain, sources, path, progress.update))
         say(_convergence_text(solved[-1]))
+    if options.export_mdp:
+        solved_problem = problem.on_road(frictions[0])
+        export_mdp(build_model(solved_problem, vehicle.params, frictions[0], chain.matrix), options.export_mdp)
+        say(f"problem: {options.export_mdp}")
     if options.plot:
         from iwm_power_manager.tools.solver_figures import draw_solution
 
@@ -184,6 +192,8 @@ def _demand_arguments(options: argparse.Namespace) -> None:
             raise ConfigError("arguments", f"--{name}", "is missing")
     if not (options.cycle or options.bag or options.transitions):
         raise ConfigError("arguments", "--cycle", "is missing", "one cycle, bag or file of transitions, or more")
+    if options.export_mdp and len(options.friction) > 1:
+        raise ConfigError("arguments", "--export-mdp", "takes one problem", "one --friction")
     check_number("arguments", "--bag-weight", options.bag_weight, 0.0, 1e6, above=True)
 
 
