@@ -31,6 +31,7 @@ from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.share import share_path
 from iwm_power_manager.solve import solve_one
 from iwm_power_manager.vehicle import load_vehicle
+from iwm_sim import learning
 from iwm_sim.closed_loop import run
 from iwm_sim.study.driving import on_all_cores
 from iwm_sim.study.names import cores
@@ -47,7 +48,7 @@ def compare(cell: tuple[str, float], learned: str, scales: int) -> list[list[tup
     """Energy, and energy with the price of moves, against equal split, %: by teacher, by variant of the cycle."""
     idle_drive, friction = cell
     vehicle = load_vehicle(share_path(CAR), idle_drive)
-    problem = load_problem(share_path("config/grids/coupled.yaml"))
+    problem = load_problem(share_path("config/grids/coupled.yaml")).for_car(vehicle.params)
     cycle = load_cycle(share_path(f"config/cycles/{learned}.csv"))
     equal = partial(run, vehicle=vehicle, settings=default_settings("equal"), policy=empty_table(), friction=friction)
     drive = equal(cycle)
@@ -62,7 +63,6 @@ def compare(cell: tuple[str, float], learned: str, scales: int) -> list[list[tup
             tables.append(
                 solve_one(problem, vehicle, friction, chain, sources, Path(folder) / "policy.npz").policy.table()
             )
-    price_j = problem.on_road(friction).switching_cost_j
     results: list[list[tuple[float, float]]] = [[] for _ in tables]
     for scale in np.linspace(1.0 - SPREAD, 1.0 + SPREAD, scales) if scales > 1 else (1.0,):
         variant = dataclasses.replace(cycle, speed_mps=cycle.speed_mps * scale)
@@ -71,8 +71,8 @@ def compare(cell: tuple[str, float], learned: str, scales: int) -> list[list[tup
         for table, result in zip(tables, results, strict=True):
             made = run(variant, vehicle, default_settings("sdp_lookahead"), table, friction)
             energy = 100.0 * (made["chemical_j"][-1] / made["distance_m"][-1] * base_m / base_j - 1.0)
-            moves_j = price_j * np.abs(np.diff(made["decided_share"])).sum()
-            result.append((float(energy), float(energy + 100.0 * moves_j / base_j)))
+            moves = learning.moves_j(np.diff(made["decided_share"]), tables[1])
+            result.append((float(energy), float(energy + 100.0 * moves / base_j)))
     return results
 
 

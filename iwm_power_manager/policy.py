@@ -5,6 +5,8 @@ A policy is one `.npz` without pickles. Its members:
 =====================  ==========================================================================================
 front_share            float64[P, V, F, R, S], the control of every state: P_front / P_demand
 cost_j                 float64[P, V, F, R, S], cost-to-go, J, rounded to a power of two below the tolerance
+dearer_cost_j          float64[D, P, V, F, R, S], the same where a change costs `control.budget.DEARER` times as much;
+                       D = 0 without a budget of changes
 demand_probability     float64[P, P], transition matrix of the power demand
 demand_by_speed        float64[V, P, P], the same for each speed; float64[0, P, P] if it does not depend on the speed
 demand_steps           float64[P], (weighted) steps counted in each of its rows
@@ -35,9 +37,11 @@ from numpy.typing import NDArray
 
 from iwm_power_manager import __version__
 from iwm_power_manager.archive import read_npz
+from iwm_power_manager.control.budget import DEARER
 from iwm_power_manager.control.table import PolicyTable, as_vector
 from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import atomic_write, check_number
+from iwm_power_manager.mdp.budget import Trial
 from iwm_power_manager.mdp.demand import DemandChain, Source
 from iwm_power_manager.mdp.policy_iteration import GATED, Iteration, Solution, expect_over_demand
 from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
@@ -48,9 +52,9 @@ from iwm_power_manager.model.decision import (
 from iwm_power_manager.vehicle import Vehicle
 
 FORMAT_NAME = "iwm_power_manager policy"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
-_ARRAYS = ("front_share", "cost_j", "demand_probability", "demand_by_speed", "demand_steps")
+_ARRAYS = ("front_share", "cost_j", "dearer_cost_j", "demand_probability", "demand_by_speed", "demand_steps")
 _MEMBERS = (*_ARRAYS, "metadata", "checksum")
 #: Peak friction coefficients a policy may be for.
 FRICTION_RANGE = (0.01, 2.0)
@@ -67,6 +71,8 @@ class Policy:
     problem : grids and settings
     friction : peak friction coefficient it was solved for
     front_share, cost_j : float64[P, V, F, R, S]
+    dearer_cost_j : float64[D, P, V, F, R, S], cost-to-go at `control.budget.DEARER` times the price of a change
+    trials : prices tried for the budget of changes, with the changes a minute of each; empty if none was searched
     chain : the demand's Markov chain
     vehicle_name, vehicle_hash, idle_drive : the car it was solved for
     sources : of the demand: name, sha256, weight, steps
@@ -81,6 +87,8 @@ class Policy:
     friction: float
     front_share: NDArray[np.float64]
     cost_j: NDArray[np.float64]
+    dearer_cost_j: NDArray[np.float64]
+    trials: tuple[Trial, ...]
     chain: DemandChain
     vehicle_name: str
     vehicle_hash: str
@@ -104,11 +112,18 @@ class Policy:
     def table(self, rule: Sequence[float] = (), schedule: Sequence[float] = ()) -> PolicyTable:
         """The numbers for the control law."""
         problem = self.problem
-        rows = problem.power_w.size
-        cost = np.ascontiguousarray(self.cost_j).reshape(rows, -1)
-        ahead = np.empty_like(cost)
-        columns = cost.shape[1]
-        expect_over_demand(self.chain.matrix, cost, columns, columns // problem.speed_mps.size, 0, columns, ahead)
+
+        def expected(cost_j: NDArray[np.float64]) -> NDArray[np.float64]:
+            rows = problem.power_w.size
+            cost = np.ascontiguousarray(cost_j).reshape(rows, -1)
+            ahead = np.empty_like(cost)
+            columns = cost.shape[1]
+            expect_over_demand(self.chain.matrix, cost, columns, columns // problem.speed_mps.size, 0, columns, ahead)
+            return ahead.reshape(problem.shape)
+
+        dearer = np.zeros((len(self.dearer_cost_j), *problem.shape))
+        for level, cost_j in enumerate(self.dearer_cost_j):
+            dearer[level] = expected(cost_j)
         return PolicyTable(
             power_w=problem.power_w,
             speed_mps=problem.speed_mps,
@@ -117,13 +132,15 @@ class Policy:
             previous_share=problem.previous_shares,
             share=problem.share,
             front_share=np.ascontiguousarray(self.front_share),
-            expected_cost_j=ahead.reshape(problem.shape),
+            expected_cost_j=expected(self.cost_j),
             discount=problem.discount,
             switching_cost_j=problem.switching_cost_j,
             switching_fixed_cost_j=problem.switching_fixed_cost_j,
             problem=problem.params(self.friction),
             rule=as_vector(rule, 4),
             schedule=as_vector(schedule, 1),
+            changes_per_min=problem.changes_per_min,
+            dearer_cost_j=dearer,
         )
 
 
@@ -142,10 +159,21 @@ def make_policy(
     chain: DemandChain,
     sources: Sequence[Source],
     solution: Solution,
+    dearer: Sequence[Solution] = (),
+    trials: Sequence[Trial] = (),
 ) -> Policy:
-    """A `Policy` from a solution. Its bound includes the rounding of the cost-to-go."""
+    """A `Policy` from a solution. Its bound includes the rounding of the cost-to-go.
+
+    Parameters
+    ----------
+    dearer : solutions at `control.budget.DEARER` times the problem's price of a change; none without a budget
+    trials : prices tried for the budget
+    """
     quantum = cost_quantum_j(problem.tolerance_j)
-    cost = np.round(solution.cost_j / quantum) * quantum + 0.0
+
+    def rounded(cost_j: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.round(cost_j / quantum) * quantum + 0.0
+
     bound = solution.bound_j + quantum / 2.0
     front_share = np.append(problem.share, np.nan)[solution.policy]
     gated = solution.policy == GATED
@@ -167,7 +195,9 @@ def make_policy(
         problem=problem,
         friction=float(friction),
         front_share=table(front_share),
-        cost_j=table(cost),
+        cost_j=table(rounded(solution.cost_j)),
+        dearer_cost_j=np.array([table(rounded(other.cost_j)) for other in dearer]).reshape(-1, *problem.shape),
+        trials=tuple(trials),
         chain=chain,
         vehicle_name=vehicle.name,
         vehicle_hash=vehicle.hash,
@@ -193,6 +223,7 @@ def _content(policy: Policy) -> tuple[dict[str, NDArray[np.float64]], bytes]:
     arrays = {
         "front_share": policy.front_share,
         "cost_j": policy.cost_j,
+        "dearer_cost_j": policy.dearer_cost_j,
         "demand_probability": policy.chain.probability,
         "demand_by_speed": policy.chain.by_speed,
         "demand_steps": policy.chain.row_steps,
@@ -211,6 +242,7 @@ def _content(policy: Policy) -> tuple[dict[str, NDArray[np.float64]], bytes]:
             "converged": policy.converged,
             "columns": list(Iteration._fields),
             "iterations": [list(iteration) for iteration in policy.iterations],
+            "prices_tried": [list(trial) for trial in policy.trials],
         },
     }
     return arrays, json.dumps(metadata, indent=1, sort_keys=True, allow_nan=False).encode()
@@ -314,6 +346,7 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
         for name, shape in (
             ("front_share", problem.shape),
             ("cost_j", problem.shape),
+            ("dearer_cost_j", (len(DEARER) if problem.changes_per_min > 0.0 else 0, *problem.shape)),
             ("demand_probability", (points, points)),
             ("demand_by_speed", (problem.speed_mps.size if problem.demand_by_speed else 0, points, points)),
             ("demand_steps", (points,)),
@@ -336,6 +369,8 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
             friction=check_number(path, "friction", metadata["friction"], *FRICTION_RANGE),
             front_share=arrays["front_share"],
             cost_j=arrays["cost_j"],
+            dearer_cost_j=arrays["dearer_cost_j"],
+            trials=tuple(Trial(*row) for row in solver["prices_tried"]),
             chain=chain,
             vehicle_name=str(metadata["vehicle"]["name"]),
             vehicle_hash=str(metadata["vehicle"]["hash"]),

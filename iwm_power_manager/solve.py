@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from iwm_power_manager.control.budget import DEARER
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.mdp.budget import Trial, find_price
 from iwm_power_manager.mdp.demand import DemandChain, Source
-from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
+from iwm_power_manager.mdp.policy_iteration import Iteration, Model, Solution, solve
 from iwm_power_manager.mdp.problem import Problem, load_problem
 from iwm_power_manager.mdp.transitions import build_model
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.policy import Policy, cost_quantum_j, make_policy, save_policy
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle
+
+#: While the price of a change is searched, a solution may be this many times as far from the optimum.
+SEARCH_TOLERANCE = 20.0
 
 
 class Solved(NamedTuple):
@@ -27,9 +37,9 @@ class Solved(NamedTuple):
     solve_s: float
 
 
-def load_grid(name: str) -> Problem:
-    """A grid of the package by its name, or of a file."""
-    return load_problem(grid_path(name))
+def load_grid(name: str, vehicle: VehicleParams) -> Problem:
+    """A grid of the package by its name, or of a file, with its axes as they are for a car."""
+    return load_problem(grid_path(name)).for_car(vehicle)
 
 
 def grid_path(name: str) -> Path:
@@ -70,15 +80,33 @@ def solve_one(
     problem = problem.on_road(friction)
     model = build_model(problem, vehicle.params, friction, chain.matrix)
     built = time.perf_counter()
-    solution: Solution = solve(
-        model,
-        problem.share,
-        # What rounding the stored cost-to-go adds is part of the promise.
-        problem.tolerance_j - cost_quantum_j(problem.tolerance_j) / 2.0,
-        problem.max_iterations,
-        update,
-    )
+    # What rounding the stored cost-to-go adds is part of the promise.
+    tolerance = problem.tolerance_j - cost_quantum_j(problem.tolerance_j) / 2.0
+    start = None
+    trials: tuple[Trial, ...] = ()
+    if problem.changes_per_min > 0.0 and problem.switching_cost_j == 0.0:
+        found = find_price(
+            model, problem.share, problem.dt_s, problem.changes_per_min, SEARCH_TOLERANCE * problem.tolerance_j
+        )
+        problem = dataclasses.replace(problem, switching_cost_j=found.price_j)
+        start, trials = found.solution.cost_j, found.trials
+    solution = _priced(model, problem, 1.0, tolerance, update, start)
+    factors = DEARER if problem.changes_per_min > 0.0 else ()
+    dearer = [_priced(model, problem, factor, tolerance, lambda _: None, solution.cost_j) for factor in factors]
     done = time.perf_counter()
-    policy = make_policy(problem, vehicle, friction, chain, sources, solution)
+    policy = make_policy(problem, vehicle, friction, chain, sources, solution, dearer, trials)
     save_policy(policy, path)
     return Solved(policy, path, built - started, done - built)
+
+
+def _priced(
+    model: Model,
+    problem: Problem,
+    factor: float,
+    tolerance_j: float,
+    update: Callable[[Iteration], None],
+    start_j: NDArray[np.float64] | None,
+) -> Solution:
+    """The solution with this many times the problem's price of a change."""
+    priced = model._replace(switching_j=factor * problem.switching_cost())
+    return solve(priced, problem.share, tolerance_j, problem.max_iterations, update, start_j)

@@ -1,11 +1,11 @@
 """Policies from recorded driving, kept only if they are no worse than one of standard cycles.
 
 Ten minutes of driving do not fill a transition matrix, and the driver's demand is no Markov chain. So how much a
-recording should count beside standard cycles, how far around its speed a step of it should, and how dear a move should
-be to a solver that does not know the driver's next one, cannot be told from the data alone; but it can be tried.
-Policies are solved with the recorded drive at several weights, bandwidths and prices, and each drives what was recorded
-in the closed loop. Of those that need no more energy than the policy of the cycles alone, the one that costs least of
-what the solver minimizes, energy and the true price of moving the split, is written; if that is not clearly less than
+recording should count beside standard cycles, and how far around its speed a step of it should, cannot be told from the
+data alone; but it can be tried. Policies are solved with the recorded drive at several weights and bandwidths, all at
+the price of a change that keeps the cycles' policy within its budget, and each drives what was recorded in the closed
+loop. Of those that need no more energy than the policy of the cycles alone, the one that costs least of
+what the solver minimizes, energy and the price of moving the split, is written; if that is not clearly less than
 what the cycles' policy costs, theirs is. (Laroche et al. 2019,
 *Safe policy improvement with baseline bootstrapping*, fall back on a baseline where data are few; here, as a whole.)
 """
@@ -21,7 +21,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from iwm_power_manager.control.budget import price_units
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.cycle import Cycle, make_cycle
@@ -39,8 +41,6 @@ from iwm_sim.study.driving import on_all_cores
 #: Weights of a recorded second beside a second of a cycle. 0: the cycles alone; infinite: the recording alone.
 CYCLES_ALONE, RECORDING_ALONE = 0.0, math.inf
 WEIGHTS = (0.05, 0.2, 0.5, 1.0, 2.0, 5.0, 20.0, RECORDING_ALONE)
-#: What a move costs the solver, of its true price. Only the true one is judged by.
-PRICES = (0.8, 0.9, 0.97, 1.0, 1.1)
 #: Of the grid's bandwidth in speed, over which steps of the demand are taken together.
 BANDWIDTHS = (1.0, 1.3)
 CYCLES = ("ftp75", "hwfet", "nycc")
@@ -56,18 +56,16 @@ class Candidate(NamedTuple):
     Attributes
     ----------
     weight : of a recorded second beside a second of a cycle
-    price : of a move in the solver, as a multiple of the true one
     bandwidth : in speed, as a multiple of the grid's
     """
 
     weight: float
-    price: float
     bandwidth: float
 
 
 #: The policy that every other one is held against.
-BASELINE = Candidate(CYCLES_ALONE, 1.0, 1.0)
-_NOT_SOLVED = Candidate(math.nan, math.nan, math.nan)
+BASELINE = Candidate(CYCLES_ALONE, 1.0)
+_NOT_SOLVED = Candidate(math.nan, math.nan)
 
 
 class Outcome(NamedTuple):
@@ -77,7 +75,7 @@ class Outcome(NamedTuple):
     ----------
     candidate : how it was solved
     energy_wh_per_km : out of the cells
-    moves_wh_per_km : true price of moving the split, in the same unit
+    moves_wh_per_km : price of moving the split, in the same unit
     changes_per_min : changes of the split that count
     trace_held : on every drive
     """
@@ -137,15 +135,8 @@ def sources_at(weight: float, recorded: Sequence[Source], general: Sequence[Sour
 
 
 def varied(problem: Problem, candidate: Candidate) -> Problem:
-    """The problem with moves at a multiple of their price, and a multiple of the bandwidth."""
-    price = candidate.price
-    by_friction = tuple((friction, cost_j * price) for friction, cost_j in problem.switching_cost_by_friction)
-    return dataclasses.replace(
-        problem,
-        switching_cost_j=problem.switching_cost_j * price,
-        switching_cost_by_friction=by_friction,
-        speed_bandwidth_mps=problem.speed_bandwidth_mps * candidate.bandwidth,
-    )
+    """The problem with a multiple of the bandwidth."""
+    return dataclasses.replace(problem, speed_bandwidth_mps=problem.speed_bandwidth_mps * candidate.bandwidth)
 
 
 def policy_path(folder: str, candidate: Candidate) -> Path:
@@ -160,12 +151,11 @@ def try_candidate(candidate: Candidate, task: Task) -> Outcome:
     chain = chain_of(problem, sources)
     path = policy_path(task.folder, candidate)
     solved = solve_one(problem, task.vehicle, task.friction, chain, sources, path)
-    true_price_j = task.problem.on_road(task.friction).switching_cost_j
-    return drive_all(candidate, "sdp_lookahead", solved.policy.table(), true_price_j, task)
+    return drive_all(candidate, "sdp_lookahead", solved.policy.table(), task)
 
 
-def drive_all(candidate: Candidate, strategy: str, table: PolicyTable, price_j: float, task: Task) -> Outcome:
-    """Drive every drive with a strategy."""
+def drive_all(candidate: Candidate, strategy: str, table: PolicyTable, task: Task) -> Outcome:
+    """Drive every drive with a strategy. A move costs what it cost the solver."""
     energy_wh = moves_wh = distance_m = minutes = changes = 0.0
     held = True
     for cycle in task.drives:
@@ -173,7 +163,7 @@ def drive_all(candidate: Candidate, strategy: str, table: PolicyTable, price_j: 
         found = measure(run, task.vehicle.params)
         lasted_min = run.series.shape[0] * run.dt_s / 60.0
         energy_wh += found.energy_wh
-        moves_wh += price_j * found.share_travel_per_min * lasted_min / 3600.0
+        moves_wh += moves_j(np.diff(run["decided_share"]), table) / 3600.0
         distance_m += found.distance_m
         minutes += lasted_min
         changes += found.share_changes_per_min * lasted_min
@@ -182,6 +172,23 @@ def drive_all(candidate: Candidate, strategy: str, table: PolicyTable, price_j: 
         raise ConfigError(", ".join(cycle.source for cycle in task.drives), "", "the car does not move")
     per_km = 1000.0 / distance_m
     return Outcome(candidate, energy_wh * per_km, moves_wh * per_km, changes / minutes, held)
+
+
+def moves_j(moves: NDArray[np.float64], table: PolicyTable) -> float:
+    """Price of moves of the share, J."""
+    if table.changes_per_min > 0.0:
+        return table.switching_cost_j * sum(price_units(float(move)) for move in moves[moves != 0.0])
+    return float(table.switching_cost_j * np.abs(moves).sum() + table.switching_fixed_cost_j * np.count_nonzero(moves))
+
+
+def at_one_price(task: Task) -> Task:
+    """The task with the price of a change that its cycles alone need for the budget, for all candidates alike."""
+    problem = task.problem.on_road(task.friction)
+    if problem.changes_per_min > 0.0 and problem.switching_cost_j == 0.0:
+        path = Path(task.folder) / "price.npz"
+        solved = solve_one(problem, task.vehicle, task.friction, chain_of(problem, task.general), task.general, path)
+        problem = solved.policy.problem
+    return task._replace(problem=problem)
 
 
 def choose(outcomes: Sequence[Outcome]) -> Outcome:
@@ -205,13 +212,11 @@ def choose(outcomes: Sequence[Outcome]) -> Outcome:
     return best if best.cost_wh_per_km < enough else safe
 
 
-def candidates_of(
-    problem: Problem, weights: Sequence[float], prices: Sequence[float], bandwidths: Sequence[float]
-) -> list[Candidate]:
-    """Give the baseline, and then every weight from the smallest to the greatest, with every price and bandwidth."""
+def candidates_of(problem: Problem, weights: Sequence[float], bandwidths: Sequence[float]) -> list[Candidate]:
+    """Give the baseline, and then every weight from the smallest to the greatest, with every bandwidth."""
     if not problem.demand_by_speed:
         bandwidths = (1.0,)
-    product = itertools.product(*(sorted(set(values)) for values in (weights, prices, bandwidths)))
+    product = itertools.product(*(sorted(set(values)) for values in (weights, bandwidths)))
     return [BASELINE, *(candidate for values in product if (candidate := Candidate(*values)) != BASELINE)]
 
 
@@ -228,7 +233,8 @@ def learn(
     task: Task, candidates: Sequence[Candidate], jobs: int, done: Callable[[Outcome], None] = lambda _: None
 ) -> Learned:
     """Try candidates, the baseline first, on one road; `done` hears of each."""
-    equal = drive_all(_NOT_SOLVED, "equal", empty_table(), 0.0, task)
+    task = at_one_price(task)
+    equal = drive_all(_NOT_SOLVED, "equal", empty_table(), task)
     # The first one in this process: what it compiles, the others find in the cache.
     outcomes = [try_candidate(candidates[0], task)]
     done(outcomes[0])

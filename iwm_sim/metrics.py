@@ -19,6 +19,8 @@ TRACE_WINDOW_S = 1.0
 
 #: A change of the front share that counts.
 SHARE_CHANGE = 0.25
+#: Shares are multiples of a step that rounding must not carry over the line.
+ROUNDING = 1e-9
 
 #: An axle counts as locked or skidding while its slip is beyond the paper's critical slip and the car moves.
 CRITICAL_SLIP = 0.2
@@ -61,12 +63,12 @@ def trace_excess_mps(trace_mps: FloatArray, speed_mps: FloatArray, dt_s: float) 
     return float(max(np.max(low - speed_mps), np.max(speed_mps - high), 0.0))
 
 
-def share_changes(share: FloatArray) -> int:
-    """Number of times the share moves by more than `SHARE_CHANGE` from where it last counted."""
+def share_changes(share: FloatArray, least: float = SHARE_CHANGE) -> int:
+    """Number of times the share moves by more than `least` from where it last counted."""
     count = 0
     level = share[0] if share.size else 0.0
     for value in share[np.flatnonzero(np.diff(share, prepend=np.nan))]:
-        if abs(value - level) > SHARE_CHANGE:
+        if abs(value - level) > least + ROUNDING:
             count += 1
             level = value
     return count

@@ -91,11 +91,32 @@ def schedule(
     -------
     float64[ceil(n * dt_s / decision_period_s)]
     """
+    cost = step_costs(power_w, speed_mps, dt_s, decision_period_s, vehicle, friction, share)
+    return cheapest_schedule(cost, share, switching_cost_j, switching_fixed_cost_j)
+
+
+def step_costs(
+    power_w: FloatArray,
+    speed_mps: FloatArray,
+    dt_s: float,
+    decision_period_s: float,
+    vehicle: VehicleParams,
+    friction: float,
+    share: FloatArray,
+) -> FloatArray:
+    """Cost of each share in each decision of a known drive, J: float64[ceil(n * dt_s / decision_period_s), U]."""
     samples = round(decision_period_s / dt_s)
     cost = np.empty((-(-power_w.size // samples), share.size))
     _tabulate(power_w, speed_mps, samples, share, friction, dt_s, vehicle, cost)
-    path = np.empty(cost.shape[0], dtype=np.int64)
-    cheapest_path(cost, share, switching_cost_j, switching_fixed_cost_j, path)
+    return cost
+
+
+def cheapest_schedule(
+    cost_j: FloatArray, share: FloatArray, switching_cost_j: float = 0.0, switching_fixed_cost_j: float = 0.0
+) -> FloatArray:
+    """Share of each decision with the least sum of costs and prices of changes."""
+    path = np.empty(cost_j.shape[0], dtype=np.int64)
+    cheapest_path(cost_j, share, switching_cost_j, switching_fixed_cost_j, path)
     return share[path]
 
 

@@ -60,9 +60,7 @@ def generate_launch_description() -> LaunchDescription:
     )
     managed = LaunchConfigurationEquals("lifecycle", "managed")
     configure = EmitEvent(
-        event=ChangeState(
-            lifecycle_node_matcher=matches_action(node), transition_id=Transition.TRANSITION_CONFIGURE
-        ),
+        event=ChangeState(lifecycle_node_matcher=matches_action(node), transition_id=Transition.TRANSITION_CONFIGURE),
         condition=managed,
     )
     activate = RegisterEventHandler(

@@ -29,6 +29,8 @@ def _tight(params, idle_drive):
 def _problem(grid, **changes):
     return dataclasses.replace(
         load_problem(share_path(f"config/grids/{grid}.yaml")),
+        power_of_car=np.zeros(0),
+        speed_of_car=np.zeros(0),
         power_w=np.array([-40000.0, -12000.0, -3000.0, -500.0, 0.0, 500.0, 6000.0, 14000.0, 25000.0]),
         speed_mps=np.array([0.0, 0.4, 2.0, 6.0, 15.0, 30.0]),
         share=np.array([0.0, 0.3, 0.5, 1.0]),

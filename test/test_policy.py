@@ -95,10 +95,11 @@ def test_the_same_policy_gives_the_same_bytes(policy, content, tmp_path):
 def test_the_file_opens_without_pickles_and_holds_what_the_documentation_says(content):
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         assert set(archive.files) == {
-            "front_share", "cost_j", "demand_probability", "demand_by_speed", "demand_steps", "metadata", "checksum",
+            "front_share", "cost_j", "dearer_cost_j", "demand_probability", "demand_by_speed", "demand_steps",
+            "metadata", "checksum",
         }  # fmt: skip
         metadata = json.loads(archive["metadata"].tobytes())
-    assert metadata["format_version"] == 1
+    assert metadata["format_version"] == 2
     assert metadata["vehicle"] == {"name": CAR.name, "hash": CAR.hash, "idle_drive": CAR.idle_drive}
     assert metadata["friction"] == 0.5
     assert metadata["problem"]["discount"] == 0.9
@@ -250,13 +251,13 @@ def test_an_object_array_is_not_unpickled(content, tmp_path_factory):
 
 
 def test_an_older_format_says_to_solve_again(content, tmp_path_factory):
-    message = _load(tmp_path_factory, _rebuilt(content, lambda m: m.update(format_version=0)))
-    assert "has format version 0, this package reads 1: solve it again with solve_policy --vehicle" in message
+    message = _load(tmp_path_factory, _rebuilt(content, lambda m: m.update(format_version=1)))
+    assert "has format version 1, this package reads 2: solve it again with solve_policy --vehicle" in message
     assert "--friction 0.5" in message
 
 
 def test_a_newer_format_says_to_update(content, tmp_path_factory):
-    assert "update the package" in _load(tmp_path_factory, _rebuilt(content, lambda m: m.update(format_version=2)))
+    assert "update the package" in _load(tmp_path_factory, _rebuilt(content, lambda m: m.update(format_version=3)))
 
 
 def test_an_edit_without_a_new_checksum_is_refused(content, tmp_path_factory):

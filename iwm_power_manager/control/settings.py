@@ -126,19 +126,6 @@ class Settings(NamedTuple):
     switching_power_w: Annotated[
         float, Setting("instantaneous_slip: a change of the share has to save this much", "W", 0.0, 1e5)
     ] = 60.0
-    # The demand's Markov chain does not know how long a demand has lasted, so that the policy takes a passing one for
-    # one that stays. Half of the power, sent back at once, is nine times as dear.
-    reversal_price: Annotated[
-        float,
-        Setting(
-            "sdp_lookahead: how much dearer it is to take a change of the share back at once, as a multiple of the "
-            "policy's own price for each unit of share taken back",
-            "",
-            0.0,
-            1000.0,
-        ),
-    ] = 16.0
-    reversal_s: Annotated[float, Setting("time constant with which reversal_price is forgotten", "s", 0.01, 60.0)] = 0.5
 
 
 def table_of(values: type[Any]) -> dict[str, Setting]:

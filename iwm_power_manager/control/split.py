@@ -6,10 +6,11 @@ strategy is written out here, from the table: plain comparisons of a number, whi
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
+from iwm_power_manager.control.budget import changes_counted, leaked
+from iwm_power_manager.control.persistence import observed
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.slew import approached
 from iwm_power_manager.control.strategies import seal
@@ -70,22 +71,24 @@ def split(
     decisions = memory.decisions
     age = memory.age_s + measurement.dt_s
     decided = memory.decided_share
-    recent = memory.recent_change
+    used = leaked(memory.changes_used, measurement.dt_s, policy.changes_per_min)
+    jitter = observed(memory.jitter, measurement.power_demand_w, measurement.dt_s)
     # Half a step of slack: sums of 0.01 s must not delay every tenth decision by a step.
     if first or age >= settings.decision_period_s - 0.5 * measurement.dt_s:
-        recent *= math.exp(-age / settings.reversal_s)
         situation = Situation(
             power_demand_w=measurement.power_demand_w,
             speed_mps=speed_mps,
             front_slip=front_slip,
             rear_slip=rear_slip,
             previous_share=decided,
-            recent_change=recent,
+            changes_used=used,
+            jitter=jitter,
             friction=measurement.friction,
             decisions=decisions,
         )
         decided = decide(situation, settings, vehicle, policy)
-        recent += decided - memory.decided_share
+        if policy.changes_per_min > 0.0:
+            used += changes_counted(decided - memory.decided_share)
         decisions += 1
         age = 0.0
     if first:
@@ -93,5 +96,10 @@ def split(
     else:
         applied = approached(memory.applied_share, decided, settings.share_rate_per_s * measurement.dt_s)
     return SplitMemory(
-        decisions=decisions, age_s=age, decided_share=decided, applied_share=applied, recent_change=recent
+        decisions=decisions,
+        age_s=age,
+        decided_share=decided,
+        applied_share=applied,
+        changes_used=used,
+        jitter=jitter,
     )

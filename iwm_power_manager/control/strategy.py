@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from iwm_power_manager.control.persistence import Jitter
+
 
 class Situation(NamedTuple):
     """What a strategy decides from.
@@ -15,7 +17,8 @@ class Situation(NamedTuple):
     speed_mps : vehicle speed
     front_slip, rear_slip : filtered slip of the axles
     previous_share : front share of the decision before, 0..1
-    recent_change : sum of the latest changes of the share, fading out; > 0 to the front
+    changes_used : what is used of the budget of changes (`control.budget`)
+    jitter : what is remembered of the demand (`control.persistence`)
     friction : peak friction coefficient to assume
     decisions : decisions taken so far in this run
     """
@@ -25,7 +28,8 @@ class Situation(NamedTuple):
     front_slip: float
     rear_slip: float
     previous_share: float
-    recent_change: float
+    changes_used: float
+    jitter: Jitter
     friction: float
     decisions: int
 

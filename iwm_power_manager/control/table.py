@@ -31,6 +31,9 @@ class PolicyTable(NamedTuple):
     problem : what `step_cost_and_next` needs
     rule : coefficients of the `rule` strategy: P_f = rule[0] + rule[1] * P_dem driving, rule[2:4] braking
     schedule : front share of each decision, for the `preview` strategy
+    changes_per_min : budget of changes of the share (`control.budget`); 0 is none
+    dearer_cost_j : float64[D, P, V, F, R, S], `expected_cost_j` at the prices `control.budget.DEARER`; D = 0 without a
+        budget
     """
 
     power_w: NDArray[np.float64]
@@ -47,6 +50,8 @@ class PolicyTable(NamedTuple):
     problem: ProblemParams
     rule: NDArray[np.float64]
     schedule: NDArray[np.float64]
+    changes_per_min: float
+    dearer_cost_j: NDArray[np.float64]
 
 
 def empty_table(
@@ -79,6 +84,8 @@ def empty_table(
         ),
         rule=as_vector(rule, 4),
         schedule=as_vector(schedule, 1),
+        changes_per_min=0.0,
+        dearer_cost_j=np.zeros((0, 1, 1, 1, 1, 1)),
     )
 
 

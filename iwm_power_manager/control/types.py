@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from iwm_power_manager.control.persistence import Jitter, no_jitter
+
 Wheels = tuple[float, float, float, float]  # in the order of `WHEEL_NAMES`
 
 #: The wheels, in the order used everywhere.
@@ -126,14 +128,16 @@ class SplitMemory(NamedTuple):
     decisions : decisions taken
     age_s : time since the last one
     decided_share, applied_share : front share, 0..1
-    recent_change : sum of the changes of the decided share, each fading out with `reversal_s`
+    changes_used : what is used of the budget of changes (`control.budget`)
+    jitter : what is remembered of the demand (`control.persistence`)
     """
 
     decisions: int
     age_s: float
     decided_share: float
     applied_share: float
-    recent_change: float
+    changes_used: float
+    jitter: Jitter
 
 
 class ControllerState(NamedTuple):
@@ -158,7 +162,9 @@ class ControllerState(NamedTuple):
 def initial_state() -> ControllerState:
     """The law's memory before its first step: at rest, cold, power split equally."""
     wheel = WheelState(motor_nm=0.0, total_nm=0.0, speed_radps=0.0, road_nm=0.0, slip=0.0, gated=False, heat=0.0)
-    split = SplitMemory(decisions=0, age_s=0.0, decided_share=0.5, applied_share=0.5, recent_change=0.0)
+    split = SplitMemory(
+        decisions=0, age_s=0.0, decided_share=0.5, applied_share=0.5, changes_used=0.0, jitter=no_jitter()
+    )
     return ControllerState(
         steps=0, split=split, wheels=(wheel, wheel, wheel, wheel), front_unequal_s=0.0, rear_unequal_s=0.0
     )

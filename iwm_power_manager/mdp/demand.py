@@ -268,6 +268,8 @@ def chain_of(problem: Problem, sources: Sequence[Source]) -> DemandChain:
     ConfigError
         There is not a single step to count, or a source lacks the speed.
     """
+    if problem.needs_car:
+        raise ConfigError(problem.name, "power_w", "is relative to a car that was not named", "Problem.for_car")
     chain = demand_chain(problem.power_w, sources)
     if not problem.demand_by_speed:
         return chain

@@ -301,6 +301,58 @@ def _gated(model, w, cost_factor, p, out):
 
 
 @kernel
+def flow(model, policy, mass, landed, out):
+    """Move a distribution over the states one step on: out = mass @ P_pi, all arrays [P, S, C]; `landed` is scratch.
+
+    A weight of the interpolation is the probability of that corner.
+    """
+    n_u = model.switching_j.shape[1]
+    n_s = model.switching_j.shape[0]
+    tracked = n_s > 1
+    powers = mass.shape[0]
+    cells = mass.shape[2]
+    neighbour = corner_steps(model.cell_shape)
+    landed[:] = 0.0
+    for p in range(powers):
+        first = model.free_start[p]
+        n = model.free_start[p + 1] - first
+        for s in range(n_s):
+            for k in range(n):
+                cell = model.free_cell[first + k]
+                if mass[p, s, cell] > 0.0:
+                    u = policy[p, s, cell]
+                    i = first * n_u + u * n + k
+                    target = u if tracked else 0
+                    _scatter(
+                        mass[p, s, cell], model.free_corner[i], neighbour, model.free_fraction[i], landed[p, target]
+                    )
+            for i in range(model.gated_start[p], model.gated_start[p + 1]):
+                cell = model.gated_cell[i]
+                _scatter(mass[p, s, cell], model.gated_corner[i], neighbour, model.gated_fraction[i], landed[p, s])
+    plane = model.cell_shape[1] * model.cell_shape[2]
+    out[:] = 0.0
+    for p in range(powers):
+        for q in range(powers):
+            if np.sum(model.demand[:, p, q]) > 0.0:
+                for s in range(n_s):
+                    for c in range(cells):
+                        group = c // plane if model.demand.shape[0] > 1 else 0
+                        out[q, s, c] += model.demand[group, p, q] * landed[p, s, c]
+
+
+@kernel
+def _scatter(mass, corner, neighbour, fraction, landed):
+    for a in range(2):
+        for b in range(2):
+            for c in range(2):
+                weight = fraction[0] if a else 1.0 - fraction[0]
+                weight *= fraction[1] if b else 1.0 - fraction[1]
+                weight *= fraction[2] if c else 1.0 - fraction[2]
+                if weight > 0.0:
+                    landed[corner + a * neighbour[0] + b * neighbour[1] + c * neighbour[2]] += mass * weight
+
+
+@kernel
 def dot(a, b):
     """Scalar product of two vectors, summed in a fixed order: BLAS's depends on the number of threads."""
     total = 0.0
@@ -424,6 +476,7 @@ def solve(
     tolerance_j: float,
     max_iterations: int = 100,
     progress: Callable[[Iteration], None] | None = None,
+    start_j: NDArray[np.float64] | None = None,
 ) -> Solution:
     """Solve the problem to a certified bound.
 
@@ -434,6 +487,7 @@ def solve(
     tolerance_j : bound on the max-norm distance from the optimal cost-to-go, J
     max_iterations : policies to try at most
     progress : called after each policy
+    start_j : float64[P, S, C], a cost-to-go to start from, such as that of a similar problem
 
     Returns
     -------
@@ -441,7 +495,7 @@ def solve(
         `converged` is False where max_iterations, or the precision of the arithmetic, ended the iteration first.
     """
     operator = _Operator(model)
-    cost = np.zeros(model.state_shape)
+    cost = np.zeros(model.state_shape) if start_j is None else start_j.copy()
     improved = np.empty_like(cost)
     # What the first policy is compared with: equal split.
     policy = np.where(_gated_mask(model), np.int16(GATED), np.int16(np.argmin(np.abs(share - 0.5))))

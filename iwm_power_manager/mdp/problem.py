@@ -12,13 +12,14 @@ does not depend on that state.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iwm_power_manager.control.budget import price_units
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import (
     check_bool,
@@ -29,6 +30,7 @@ from iwm_power_manager.files import (
     dotted,
     read_yaml,
 )
+from iwm_power_manager.model.chassis import road_load_n
 from iwm_power_manager.model.decision import (
     ERROR_NORMS,
     POWER_ERRORS,
@@ -36,6 +38,7 @@ from iwm_power_manager.model.decision import (
     SLIP_MODELS,
     ProblemParams,
 )
+from iwm_power_manager.model.parameters import VehicleParams
 
 FORMAT = 1
 
@@ -70,6 +73,10 @@ class Problem:
     prior_steps : with it, the chain of all speeds counts as this many steps in every row, where data are few
     tolerance_j : solve until the cost-to-go is certified to be this close to the optimal one, J
     max_iterations : give up after this many policies
+    changes_per_min : budget of changes of the share (`control.budget`); 0 is none. With it, a `switching_cost_j` of 0
+        is to be found by the solver (`mdp.budget`)
+    power_of_car, speed_of_car : points of an axis that is relative to the car; none where it is absolute, and in what
+        `for_car` returns
     """
 
     name: str
@@ -96,6 +103,28 @@ class Problem:
     prior_steps: float
     tolerance_j: float
     max_iterations: int
+    changes_per_min: float = 0.0
+    power_of_car: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    speed_of_car: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def needs_car(self) -> bool:
+        """Whether axes are still relative: `for_car` makes them absolute."""
+        return self.power_of_car.size > 0 or self.speed_of_car.size > 0
+
+    def for_car(self, vehicle: VehicleParams) -> Problem:
+        """The problem with axes in W and m/s: relative points are multiples of the car's power and top speed."""
+        if not self.needs_car:
+            return self
+        power, speed = self.power_w, self.speed_mps
+        if self.power_of_car.size:
+            power = np.round(self.power_of_car * motor_power_w(vehicle), 1) + 0.0
+        if self.speed_of_car.size:
+            points = np.round(self.speed_of_car * top_speed_mps(vehicle), 2)
+            # Points of both kinds must not crowd where they meet.
+            speed = np.concatenate([speed, points[points > 1.1 * speed[-1]]])
+        none = np.zeros(0)
+        return dataclasses.replace(self, power_w=power, speed_mps=speed, power_of_car=none, speed_of_car=none)
 
     def params(self, friction: float) -> ProblemParams:
         """The numbers the kernels take, for one road."""
@@ -139,14 +168,40 @@ class Problem:
         change = np.abs(self.previous_shares[:, None] - self.share[None, :])
         if not self.previous_share:
             return np.zeros_like(change)
+        if self.changes_per_min > 0.0:
+            return self.switching_cost_j * price_matrix(self.share)
         return self.switching_cost_j * change + self.switching_fixed_cost_j * (change > 0.0)
 
     def settings(self) -> dict[str, Any]:
         """Every setting by name, as plain values: what a policy file records."""
         return {
-            field.name: value.tolist() if isinstance(value := getattr(self, field.name), np.ndarray) else value
-            for field in dataclasses.fields(self)
+            entry.name: value.tolist() if isinstance(value := getattr(self, entry.name), np.ndarray) else value
+            for entry in dataclasses.fields(self)
+            if entry.name not in ("power_of_car", "speed_of_car")
         }
+
+
+def price_matrix(share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """float64[U, U]: what a change from a share (rows) to another (columns) costs, in prices of a change."""
+    return np.array([[price_units(after - before) for after in share] for before in share])
+
+
+def motor_power_w(vehicle: VehicleParams) -> float:
+    """Power of all motors, W: the unit of a relative power axis."""
+    return 2.0 * (vehicle.front.motor.max_power_w + vehicle.rear.motor.max_power_w)
+
+
+def top_speed_mps(vehicle: VehicleParams) -> float:
+    """Speed at which the road load takes all motors' power, m/s: the unit of a relative speed axis; 100 at most."""
+    power = motor_power_w(vehicle)
+    low, high = 1.0, 100.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if road_load_n(middle, 0.0, vehicle.chassis) * middle < power:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 _AXES = {  # axis: (low, high, unit)
@@ -173,6 +228,7 @@ _OPTIONAL = (
     "prior_steps",
     "tolerance_j",
     "max_iterations",
+    "changes_per_min",
 )
 
 
@@ -191,7 +247,7 @@ def problem_from(content: Any, path: Path | str) -> Problem:
     """A `Problem` from the mapping a problem file holds; `path` is what errors name."""
     check_keys(path, content, _REQUIRED, _OPTIONAL)
     check_integer(path, "format", content["format"], FORMAT, FORMAT)
-    axes = {key: read_axis(path, key, content[key], *limits) for key, limits in _AXES.items()}
+    axes = {key: read_axis(path, key, _absolute(content[key]), *limits) for key, limits in _AXES.items()}
     switching = {
         key: check_number(path, key, content.get(key, 0.0), 0.0, 1e6, unit="J")
         for key in ("switching_cost_j", "switching_fixed_cost_j")
@@ -223,6 +279,11 @@ def problem_from(content: Any, path: Path | str) -> Problem:
         prior_steps=check_number(path, "prior_steps", content.get("prior_steps", 5.0), 0.0, 1e9, above=True),
         tolerance_j=check_number(path, "tolerance_j", content.get("tolerance_j", 0.01), 1e-6, 1e6, unit="J"),
         max_iterations=check_integer(path, "max_iterations", content.get("max_iterations", 100), 1, 10_000),
+        changes_per_min=check_number(
+            path, "changes_per_min", content.get("changes_per_min", 0.0), 0.0, 1e4, unit="1/min"
+        ),
+        power_of_car=_relative(path, "power_w", content["power_w"], -10.0),
+        speed_of_car=_relative(path, "speed_mps", content["speed_mps"], 0.0),
     )
     _check_combination(problem, path)
     return problem
@@ -237,13 +298,30 @@ def _check_combination(problem: Problem, path: Path | str) -> None:
     if problem.switching_cost_by_friction and problem.switching_cost_j > 0.0:
         raise ConfigError(path, "switching_cost_by_friction", "stands beside switching_cost_j", "one of them")
     if not problem.previous_share:
-        for key in ("switching_cost_j", "switching_cost_by_friction", "switching_fixed_cost_j"):
+        for key in ("switching_cost_j", "switching_cost_by_friction", "switching_fixed_cost_j", "changes_per_min"):
             if getattr(problem, key) not in (0.0, ()):
                 raise ConfigError(path, key, "needs previous_share: true", "0, or previous_share: true")
-    pairs = int(np.prod([float(n) for n in problem.shape[:4]])) * problem.share.size
+    powers = max(problem.power_w.size, problem.power_of_car.size)
+    speeds = problem.speed_mps.size + problem.speed_of_car.size
+    pairs = int(float(powers) * speeds * problem.slip_front.size * problem.slip_rear.size * problem.share.size)
     if pairs > MAX_PAIRS:
         problem_text = f"has {pairs:.3g} pairs of state and control"
         raise ConfigError(path, "", problem_text, f"<= {MAX_PAIRS:.3g}: use coarser axes")
+
+
+def _absolute(value: Any) -> Any:
+    """The part of an axis that does not depend on the car; rest, where all of it does."""
+    if isinstance(value, dict) and "of_car" in value:
+        return value.get("fixed", [0.0])
+    return value
+
+
+def _relative(path: Path | str, key: str, value: Any, low: float) -> NDArray[np.float64]:
+    """The part of an axis that is given in multiples of the car's own power or top speed."""
+    if not (isinstance(value, dict) and "of_car" in value):
+        return np.zeros(0)
+    check_keys(path, value, ("of_car",), ("fixed",), key)
+    return read_axis(path, dotted(key, "of_car"), value["of_car"], low, 10.0, "")
 
 
 def _by_friction(path: Path | str, value: Any) -> tuple[tuple[float, float], ...]:
@@ -264,6 +342,8 @@ def _by_friction(path: Path | str, value: Any) -> tuple[tuple[float, float], ...
 
 def read_axis(file: Path | str, key: str, value: Any, low: float, high: float, unit: str) -> NDArray[np.float64]:
     """An axis from a list of numbers, from `{from, to, step}`, or from `{mirrored: [0, a, b, ...]}`.
+
+    `{fixed: AXIS, of_car: AXIS}` is read in two parts, the second in multiples of the car's power or top speed.
 
     Raises
     ------

@@ -11,15 +11,15 @@ from typing import NamedTuple
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import chemical_power_w
-from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
+from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.gate import axle_gated, gated_split
 from iwm_power_manager.model.limits import battery_scale, car_power_w
 from iwm_power_manager.model.longitudinal import step
 from iwm_power_manager.model.motor import idle_drag_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
-from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
+from iwm_power_manager.model.quasi_steady import USABLE_FRICTION, demand_force_n, split_outcome_w
 from iwm_power_manager.model.torque import blend, conversion_speed_radps
-from iwm_power_manager.model.tyre import slip_ratio
+from iwm_power_manager.model.tyre import peak_ratio, slip_ratio
 
 #: Where the delivered power is measured: torque times speed at the wheel (sees no power lost in slip), or at the
 
@@ -72,6 +72,11 @@ class ProblemParams(NamedTuple):
     skid_avoidance: int
     critical_slip: float
 
+
+#: What an axle is asked for beyond its grip goes to the other one, but only once its wheels have begun to slip and the
+#: slip limiter has answered: for its time constant, s, that power spins wheels. It is what tells apart the shares that
+#: saturate both axles, which are all alike in the settled model.
+HANDOVER_S = 0.025
 
 #: A slip of 1 would be an infinite wheel speed; the state "spinning" stands for this one.
 SPINNING_SLIP = 0.95
@@ -258,7 +263,7 @@ def _quasi_steady_step(
     battery = vehicle.battery
     dt = problem.dt_s
     force = demand_force_n(power_demand_w, speed_mps, problem.friction, True, vehicle)
-    power, missing = split_power_w(force, speed_mps, front_share, problem.friction, True, vehicle)
+    power, missing, over = split_outcome_w(force, speed_mps, front_share, problem.friction, True, vehicle)
     shortfall = 0.0
     if power_demand_w > 0.0:
         shortfall = missing * speed_mps + max(power - chemical_power_w(battery.discharge_limit_w, battery), 0.0)
@@ -266,9 +271,17 @@ def _quasi_steady_step(
     else:
         power = max(power, chemical_power_w(-battery.charge_limit_w, battery))
         given = force + missing
+    # A driver makes up for what a split did not deliver: the speed follows what was asked for, as far as the road can
+    # carry it. Would it follow what was delivered, then braking less than was asked for would leave a higher speed, at
+    # which the same power is less force, and less of it were missing: a policy would be rewarded for not braking.
+    weight = vehicle.chassis.mass_kg * GRAVITY_MPS2
+    grip = (
+        USABLE_FRICTION * problem.friction * max(peak_ratio(vehicle.front.tyre), peak_ratio(vehicle.rear.tyre)) * weight
+    )
     resistance = road_load_n(speed_mps, 0.0, vehicle.chassis)
-    after = max(speed_mps + dt * (given - resistance) / equivalent_mass_kg(vehicle), 0.0)
+    acceleration = (min(max(force, -grip), grip) - resistance) / equivalent_mass_kg(vehicle)
+    after = max(speed_mps + dt * acceleration, 0.0)
     # What is missing at rest still counts: a car that cannot pull away has not delivered its demand.
     rolling = max(speed_mps, vehicle.driver.power_speed_floor_mps)
     error = error_cost_j(force * rolling, given * rolling, problem)
-    return Step(power * dt + error, after, 0.0, 0.0, shortfall)
+    return Step(power * dt + error + over * rolling * HANDOVER_S, after, 0.0, 0.0, shortfall)

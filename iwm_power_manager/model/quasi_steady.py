@@ -43,7 +43,16 @@ def axle_power_w(
 def split_power_w(
     force_n: float, speed_mps: float, front_share: float, friction: float, slip_aware: bool, vehicle: VehicleParams
 ) -> tuple[float, float]:
-    """Chemical battery power for a road force at a front share, and the force that cannot be delivered.
+    """Chemical battery power for a road force at a front share, W, and the force that cannot be delivered, N."""
+    power, missing, _ = split_outcome_w(force_n, speed_mps, front_share, friction, slip_aware, vehicle)
+    return power, missing
+
+
+@kernel
+def split_outcome_w(
+    force_n: float, speed_mps: float, front_share: float, friction: float, slip_aware: bool, vehicle: VehicleParams
+) -> tuple[float, float, float]:
+    """Chemical battery power for a road force at a front share, and what the axles could not do of it.
 
     Parameters
     ----------
@@ -55,7 +64,8 @@ def split_power_w(
 
     Returns
     -------
-    battery power (W, eq. 21), missing force (N, >= 0)
+    battery power (W, eq. 21), missing force (N, >= 0), force an axle was asked for beyond its grip (N, >= 0; what the
+    other one could take over of it is not missing)
     """
     chassis = vehicle.chassis
     front_radius = vehicle.front.wheel.radius_m
@@ -71,7 +81,7 @@ def split_power_w(
     rear = force_n - front
     if front == 0.0 and rear == 0.0:
         idle_w = electrical_power_w(0.0, front_rolling, front_motor) + electrical_power_w(0.0, rear_rolling, rear_motor)
-        return chemical_power_w(2.0 * idle_w, vehicle.battery), 0.0
+        return chemical_power_w(2.0 * idle_w, vehicle.battery), 0.0, 0.0
     # An idle axle's drag is a force too; the working axle has to overcome it.
     if front == 0.0:
         rear += 2.0 * idle_drag_nm(0.0, front_rolling, front_motor) / front_radius
@@ -87,6 +97,7 @@ def split_power_w(
         grip = 2.0 * USABLE_FRICTION * friction
         room_front = grip * peak_ratio(vehicle.front.tyre) * normal_front
         room_rear = grip * peak_ratio(vehicle.rear.tyre) * normal_rear
+    over = max(need_front - room_front, 0.0) + max(need_rear - room_rear, 0.0)
     if sign > 0.0:
         room_front = min(room_front, 2.0 * torque_limit_nm(front_rolling, 0.0, front_motor) / front_radius)
         room_rear = min(room_rear, 2.0 * torque_limit_nm(rear_rolling, 0.0, rear_motor) / rear_radius)
@@ -98,7 +109,7 @@ def split_power_w(
     power = axle_power_w(
         sign * given_front, speed_mps, normal_front, friction, slip_aware, vehicle.front
     ) + axle_power_w(sign * given_rear, speed_mps, normal_rear, friction, slip_aware, vehicle.rear)
-    return chemical_power_w(power, vehicle.battery), missing
+    return chemical_power_w(power, vehicle.battery), missing, over
 
 
 @kernel

@@ -12,6 +12,7 @@ from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.mdp.demand_counts import DemandCounter, load_transitions, save_transitions
 from iwm_power_manager.mdp.problem import load_problem
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.ros import diagnostics
 from iwm_power_manager.share import share_path
 
@@ -28,6 +29,7 @@ class DemandLog:
     path : file to write; one that exists is gone on from
     period_s : time between two writes
     table : policy in use, whose axes are counted on; without a policy those of the package's grid `coupled`
+    vehicle : the car, whose powers and speeds that grid is relative to
 
     Raises
     ------
@@ -35,12 +37,12 @@ class DemandLog:
         The file that exists is no such file, or is on other axes.
     """
 
-    def __init__(self, path: Path, period_s: float, table: PolicyTable) -> None:
+    def __init__(self, path: Path, period_s: float, table: PolicyTable, vehicle: VehicleParams) -> None:
         self._path = path
         self._period_s = period_s
         axes = table.power_w, table.speed_mps, table.problem.dt_s
         if table.power_w.size < 2:
-            grid = load_problem(share_path("config/grids/coupled.yaml"))
+            grid = load_problem(share_path("config/grids/coupled.yaml")).for_car(vehicle)
             axes = grid.power_w, grid.speed_mps, grid.dt_s
         before = load_transitions(path) if path.exists() else None
         if before is not None and not before.fits(*axes):

@@ -295,7 +295,7 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         )
         if values["demand_log"]:
             path, period_s = Path(values["demand_log"]), values["demand_log_period_s"]
-            self._demand_log = DemandLog(path, period_s, self._controller.policy)
+            self._demand_log = DemandLog(path, period_s, self._controller.policy, prepared.vehicle.params)
         rate_hz = None if self._lockstep else values["rate_hz"]
         self._report = PowerManagerReport(self.get_fully_qualified_name(), self._wheel_names, rate_hz)
 

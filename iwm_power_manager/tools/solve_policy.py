@@ -151,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _solve(options: argparse.Namespace) -> int:
     _demand_arguments(options)
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
-    problem = _problem(options)
+    problem = _problem(options, vehicle)
     frictions = [check_number("arguments", "--friction", value, 0.01, 2.0) for value in options.friction]
     paths = targets(Path(options.output), vehicle, problem, frictions)
     say = _silent if options.quiet else print
@@ -197,8 +197,8 @@ def _demand_arguments(options: argparse.Namespace) -> None:
     check_number("arguments", "--bag-weight", options.bag_weight, 0.0, 1e6, above=True)
 
 
-def _problem(options: argparse.Namespace) -> Problem:
-    problem = load_grid(options.grid)
+def _problem(options: argparse.Namespace, vehicle: Vehicle) -> Problem:
+    problem = load_grid(options.grid, vehicle.params)
     if options.discount is None:
         return problem
     discount = check_number("arguments", "--discount", options.discount, 0.0, 0.9999)
@@ -311,6 +311,8 @@ def _problem_text(problem: Problem, vehicle: Vehicle) -> str:
 
 
 def _price_text(problem: Problem) -> str:
+    if problem.changes_per_min > 0.0 and problem.switching_cost_j == 0.0:
+        return f"priced for {problem.changes_per_min:g} changes a minute"
     if not problem.switching_cost_by_friction:
         return f"{problem.switching_cost_j:g} J"
     return ", ".join(f"{price:g} J at friction {friction:g}" for friction, price in problem.switching_cost_by_friction)
@@ -337,6 +339,9 @@ def _convergence_text(result: Solved) -> str:
         f"{i.number:6d} {i.evaluation_sweeps:9d} {i.bound_j:11.3e} {i.policy_change:16.6g} {i.changed_states:16d}"
         for i in policy.iterations
     ]
+    if policy.trials:
+        lines.append("price of a change, J: changes a minute")
+        lines.append("  " + "".join(f"{t.price_j:.4g}: {t.changes_per_min:<8.3g}" for t in policy.trials).rstrip())
     verdict = "certified" if policy.converged else "NOT within the tolerance: only certified"
     lines.append(
         f"{verdict} to {policy.bound_j:.2g} J in {result.build_s:.2f} + {result.solve_s:.2f} s (tabulate + solve)\n"

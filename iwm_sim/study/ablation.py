@@ -127,7 +127,7 @@ def _changed(
 ) -> Case:
     """The paper's strategy with some steps taken, solved on a grid of its own."""
     paper_grid = VARIANTS[labels.PAPER_SDP].grid
-    settings: dict[str, Any] = load_grid(paper_grid).settings()
+    settings: dict[str, Any] = load_grid(paper_grid, policies.car(base.idle_drive).params).settings()
     for name in names:
         settings |= STEPS[name].settings
     del settings["name"]

@@ -87,6 +87,7 @@ class Policies:
                 "format": PROBLEM_FORMAT,
                 "switching_cost_j": factor * problem.switching_cost_j,
                 "switching_fixed_cost_j": factor * problem.switching_fixed_cost_j,
+                "changes_per_min": problem.changes_per_min / factor,
             }
             del settings["name"]
             grid = folder / f"price_{price:g}_j.yaml"  # JSON is YAML

@@ -128,7 +128,7 @@ def solved(
         what = f"solving the policy on grid {grid_file.stem} for friction {friction:g}, idle_drive {vehicle.idle_drive}"
         say(f"{because}; {what}" if because else what)
         folder.mkdir(parents=True, exist_ok=True)
-        problem = load_problem(grid_file)
+        problem = load_problem(grid_file).for_car(vehicle.params)
         sources = [source_of(load_cycle(resolve(cycle)), problem, vehicle.params) for cycle in cycles]
         solve_one(problem, vehicle, friction, chain_of(problem, sources), sources, file)
     return str(file)

@@ -72,6 +72,8 @@ MODES = {
     "paper": _COMMON | {"--paper", "--cycle", "--idle-drive"},
     "figure": _COMMON | {"--figure", "--plot"},
     "ablation": _COMMON | {"--ablation", "--json"},
+    "frontier": {"--frontier", "--vehicle", "--idle-drive", "--cycle", "--friction", "--budgets", "--quiet"},
+    "unseen": {"--unseen", "--vehicle", "--idle-drive", "--seeds", "--cycles", "--cars", "--jobs", "--quiet"},
     "scenario": {"--scenario", "--strategy", "--idle-drive", "--json", "--quiet"},
     "fit_battery": {"--fit-battery", "--vehicle", "--quiet", "--plot", "--json", "--cycle", "--friction"}
     | {"--idle-drive", "--initial-soc"},
@@ -205,11 +207,25 @@ def _add_modes(parent: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--scenario", **several, metavar="NAME", help="real roads: files, or names of config/scenarios (see make roads)"
     )
+    group.add_argument(
+        "--frontier",
+        metavar="DIR",
+        help="saving against changes: ours over budgets, its rival over thresholds",
+    )
+    group.add_argument(
+        "--unseen", metavar="DIR", help="the same at the default budget, on cycles and cars drawn from seeds"
+    )
     group.add_argument("--ablation", action="store_true", help="what each choice of the paper's program costs")
     group.add_argument(
         "--fit-battery", action="store_true", help="fit the control model's battery to the plant (eq. 25, Fig. 7)"
     )
     group.add_argument("--study", metavar="DIR", help="all tables and figures of the paper, and beyond, into a folder")
+    parent.add_argument(
+        "--budgets", **several, type=number(0.1, 1e4), metavar="N", help="--frontier: changes a minute (1000: free)"
+    )
+    parent.add_argument("--seeds", type=whole(0, 10**9), default=1000, metavar="FIRST", help="--unseen: first seed")
+    parent.add_argument("--cycles", type=whole(0, 10_000), default=200, metavar="N", help="--unseen: cycles drawn")
+    parent.add_argument("--cars", type=whole(0, 10_000), default=20, metavar="N", help="--unseen: cars drawn")
     parent.add_argument("--plot", metavar="SVG|PNG", help="--figure, --fit-battery: the picture")
     parent.add_argument(
         "--update-doc", metavar="MD", help="--study: also replace the generated part of this file (docs/study.md)"

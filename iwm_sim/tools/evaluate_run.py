@@ -21,9 +21,20 @@ from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.road_report import text as road_text
 from iwm_sim.road_run import check_scenario
 from iwm_sim.scenario import load_scenario
-from iwm_sim.study import ablation, battery_fit, cases, figures, paper, reproduce, single
+from iwm_sim.study import (
+    ablation,
+    battery_fit,
+    cases,
+    figures,
+    frontier,
+    frontier_figure,
+    paper,
+    reproduce,
+    single,
+    unseen,
+)
 from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result, SensorNoise
-from iwm_sim.study.driving import Progress, drive_all, silent, tell, warm_up, with_rules
+from iwm_sim.study.driving import Progress, drive_all, on_all_cores, silent, tell, warm_up, with_rules
 from iwm_sim.study.names import REFERENCE, TABLES
 from iwm_sim.study.plan import Policies
 from iwm_sim.study.policies import PolicySource
@@ -287,7 +298,61 @@ def _scenario(options: argparse.Namespace) -> None:
         atomic_write(options.json, (json.dumps(rows, indent=1, allow_nan=False) + "\n").encode())
 
 
+def _frontier(options: argparse.Namespace) -> None:
+    if not options.cycle:
+        raise ConfigError("arguments", "--cycle", "is missing", "one drive cycle or more, for instance nycc")
+    folder = _folder(options.frontier)
+    found = []
+    for idle_drive in options.idle_drive or [""]:
+        vehicle = cases.vehicle_of(options.vehicle, idle_drive)
+        for name in options.cycle:
+            cycle = cases.cycle_of(name)
+            for friction in options.friction or [0.9]:
+                label = f"{vehicle.name}, {vehicle.idle_drive}, {cycle.name}, friction {friction:g}"
+                place = frontier.Place(label, vehicle, cycle, friction)
+                with tempfile.TemporaryDirectory() as policies:
+                    found.append(unseen.budgets_of(place, options.budgets or frontier.BUDGETS_PER_MIN, Path(policies)))
+                picture = folder / f"{vehicle.name}_{vehicle.idle_drive}_{cycle.name}_{round(friction * 100):03d}.svg"
+                frontier_figure.draw_frontier(found[-1], picture)
+                if not options.quiet:
+                    print(f"{label}: {picture}")
+    atomic_write(folder / "frontier.json", unseen.to_json(found))
+
+
+def _unseen(options: argparse.Namespace) -> None:
+    folder = _folder(options.unseen)
+    idle_drive = (options.idle_drive or [""])[0]
+    wanted = unseen.cells(options.vehicle, idle_drive, options.seeds, options.cycles, options.cars)
+    if not wanted:
+        raise ConfigError("arguments", "--unseen", "has neither cycles nor cars", "--cycles or --cars")
+    say = silent if options.quiet else tell
+    started = time.perf_counter()
+    made = [unseen.drive_cell(wanted[0])]
+    each_s = time.perf_counter() - started
+    rest_min = each_s * (len(wanted) - 1) / options.jobs / 60.0
+    say(f"{len(wanted)} cells from seed {options.seeds} on; by the first, at most about {rest_min:.0f} min")
+    made += on_all_cores(unseen.drive_cell, wanted[1:], options.jobs)
+    atomic_write(folder / "unseen.json", unseen.to_json(made))
+    frontier_figure.draw_margins(made, folder / "margins.svg")
+    text = unseen.report(made)
+    atomic_write(folder / "unseen.txt", (text + "\n").encode())
+    if not options.quiet:
+        took_min = (time.perf_counter() - started) / 60.0
+        print(f"{text}\nin {took_min:.0f} min: {folder}/unseen.json, margins.svg, unseen.txt")
+
+
+def _folder(path: str) -> Path:
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError("arguments", str(path), f"{error.strerror}", "a folder") from None
+    return folder
+
+
 _RUN = {
+    "frontier": _frontier,
+    "unseen": _unseen,
     "": _evaluate,
     "study": _study,
     "paper": _paper,

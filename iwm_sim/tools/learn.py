@@ -34,7 +34,6 @@ from iwm_sim.learning import (
     CHANCE_PERCENT,
     CYCLES,
     CYCLES_ALONE,
-    PRICES,
     RECORDING_ALONE,
     WEIGHTS,
     Candidate,
@@ -54,10 +53,9 @@ _DESCRIPTION = """\
 Learn a policy from recorded driving, and keep it only if it is no worse than one of standard cycles.
 
 Policies are solved from the recorded drives alone and beside the cycles, a recorded second counting as much as several
-seconds of a cycle, or as a part of one, with steps of the demand taken together over more or less speed, and with moves
-of the split a little cheaper or dearer than they are. Each of them drives the recorded speed in simulation. Of those
-that need no more energy than the cycles' own policy, the one with the least cost is written: energy, and the true price
-of moving the split, which is what policies are solved for.
+seconds of a cycle, or as a part of one, and with steps of the demand taken together over more or less speed. Each of
+them drives the recorded speed in simulation. Of those that need no more energy than the cycles' own policy, the one
+with the least cost is written: energy, and the price of moving the split, which is what policies are solved for.
 If none costs at least 0.01 % less than the cycles' policy, that one is written: smaller differences are chance, a
 change of the split a moment sooner or later.
 """
@@ -71,7 +69,7 @@ examples:
     learn_policy --vehicle my_car.yaml --bag drive_1 --mapping my_topics.yaml --drive my_commute.csv \\
                  --friction 0.9 --output my_policies/
 
-A bag knows no grade: a recorded speed is driven on the flat. With all weights, prices and bandwidths 81 policies are
+A bag knows no grade: a recorded speed is driven on the flat. With all weights and bandwidths 17 policies are
 solved and driven on each road; after the first, the command says how long that will take. Results go to stdout,
 progress to stderr.
 
@@ -109,14 +107,6 @@ def parser() -> argparse.ArgumentParser:
         f"(default: {' '.join(f'{weight:g}' for weight in WEIGHTS)})",
     )
     result.add_argument(
-        "--prices",
-        nargs="+",
-        type=float,
-        default=list(PRICES),
-        metavar="P",
-        help=f"a move costs the solver P times its price (default: {' '.join(f'{price:g}' for price in PRICES)})",
-    )
-    result.add_argument(
         "--bandwidths",
         nargs="+",
         type=float,
@@ -151,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _learn(options: argparse.Namespace) -> None:
     _check(options)
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
-    problem = load_grid(options.grid)
+    problem = load_grid(options.grid, vehicle.params)
     frictions = [check_number("arguments", "--friction", value, 0.01, 2.0) for value in options.friction]
     paths = targets(Path(options.output), vehicle, problem, frictions)
     general = tuple(source_of(load_cycle(resolve(name)), problem, vehicle.params) for name in options.cycle or CYCLES)
@@ -162,7 +152,7 @@ def _learn(options: argparse.Namespace) -> None:
         if options.drive
         else [recorded_cycle(name, drive) for name, drive in recordings]
     )
-    candidates = candidates_of(problem, options.weights, options.prices, options.bandwidths)
+    candidates = candidates_of(problem, options.weights, options.bandwidths)
     roads = []
     for friction, path in zip(frictions, paths, strict=True):
         with tempfile.TemporaryDirectory(prefix="iwm-learn-") as folder:
@@ -177,7 +167,6 @@ def _learn(options: argparse.Namespace) -> None:
                 "policy": str(path),
                 "checksum": learned.policy.checksum,
                 "chosen_weight": _named(learned.chosen.candidate.weight),
-                "chosen_price": learned.chosen.candidate.price,
                 "chosen_bandwidth": learned.chosen.candidate.bandwidth,
                 "equal": _row(learned.equal),
                 "outcomes": [_row(outcome) for outcome in learned.outcomes],
@@ -192,10 +181,9 @@ def _check(options: argparse.Namespace) -> None:
     for weight in options.weights:
         if not weight >= 0.0:
             raise ConfigError("arguments", "--weights", f"{weight:g} is out of range", "0 or more, inf included")
-    for key, values in (("--prices", options.prices), ("--bandwidths", options.bandwidths)):
-        for value in values:
-            if not 0.0 < value < math.inf:
-                raise ConfigError("arguments", key, f"{value:g} is out of range", "above 0 and finite")
+    for value in options.bandwidths:
+        if not 0.0 < value < math.inf:
+            raise ConfigError("arguments", "--bandwidths", f"{value:g} is out of range", "above 0 and finite")
 
 
 def _tried(task: Task, candidates: Sequence[Candidate], jobs: int, quiet: bool) -> Learned:
@@ -225,7 +213,7 @@ def _announcing(bar: Any, count: int, jobs: int) -> Callable[[Outcome], None]:
 
 
 def _named(number: float) -> float | str | None:
-    """A weight or price as JSON has it, which knows no infinite numbers; null where there is none."""
+    """A weight as JSON has it, which knows no infinite numbers; null where there is none."""
     if math.isnan(number):
         return None
     return "inf" if math.isinf(number) else number
@@ -243,13 +231,13 @@ def _text(task: Task, learned: Learned, path: Path) -> str:
     lines = [
         f"friction {task.friction:g}, idle drive {task.vehicle.idle_drive}; driven: {drives}",
         f"equal split: {equal_wh:.2f} Wh/km; saved by policies, %:",
-        "recorded second counts as   moves at   bandwidth   energy   with price of moves   changes/min   trace",
+        "recorded second counts as   bandwidth   energy   with price of moves   changes/min   trace",
     ]
     for outcome in best_of_each_weight(learned.outcomes):
         saved = 100.0 * (1.0 - outcome.energy_wh_per_km / equal_wh)
         net = saved - 100.0 * outcome.moves_wh_per_km / equal_wh
         lines.append(
-            f"{_weight_text(outcome.candidate.weight):<27} {outcome.candidate.price:8.2f}   "
+            f"{_weight_text(outcome.candidate.weight):<27} "
             f"{outcome.candidate.bandwidth:9.2f}  {saved:7.3f}   {net:19.3f}   "
             f"{outcome.changes_per_min:11.1f}   "
             f"{'held' if outcome.trace_held else 'left'}{'   <- chosen' if outcome is learned.chosen else ''}"

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control import law
 from iwm_power_manager.control import types as t
+from iwm_power_manager.control.persistence import no_jitter
 from iwm_power_manager.control.settings import (
     GATE_MODE_LIMITER,
     GATE_MODE_OFF,
@@ -179,7 +180,6 @@ TUNINGS = st.builds(
     slip_target=st.sampled_from((0.15, 0.08)),
     slip_filter_s=st.sampled_from((0.0, 0.02)),
     slip_speed_floor_mps=st.sampled_from((0.5, 1.0)),
-    reversal_s=st.sampled_from((0.5, 0.01)),
     front_yaw_nm=st.sampled_from((0.0, 600.0, 1e5)),
     front_yaw_growth_nmps=st.sampled_from((0.0, 2000.0)),
     rear_yaw_nm=st.sampled_from((0.0, 300.0)),
@@ -214,7 +214,8 @@ MEMORIES = st.builds(
         age_s=AGES,
         decided_share=SHARES,
         applied_share=SHARES,
-        recent_change=st.floats(-2.0, 2.0),
+        changes_used=st.floats(0.0, 12.0),
+        jitter=st.just(no_jitter()),
     ),
     wheels=FOUR_STATES,
     front_unequal_s=AGES,
@@ -442,7 +443,10 @@ def it_does_what_the_plain_law_does(case):
     ours = [(motor, brake) for _, motor, brake, *_ in case.wheels()]
     assert ours == [(near(a.motor), near(a.friction)) for a in wheels]
     assert [state.gated for state in after.wheels] == [a.gated for a in wheels]
-    assert (command.front_slip, command.rear_slip) == (near(axles[0].slip), near(axles[1].slip))
+    for slip, axle in ((command.front_slip, axles[0]), (command.rear_slip, axles[1])):
+        # Of two slips that are alike but for their sign and rounding, either is the worse one.
+        assert any(slip == near(wheel.slip) for wheel in axle.wheels)
+        assert abs(slip) == near(abs(axle.slip))
     assert (command.front_share, command.decided_share) == (near(share), near(decided))
     assert {name for bit, name in t.LIMIT_NAMES.items() if command.limits & bit} == {t.LIMIT_NAMES[x] for x in bits}
     for i, state in enumerate(after.wheels):
@@ -462,9 +466,9 @@ def it_does_what_the_plain_law_does(case):
     assert after.split.decisions == before.decisions + taken
     age = before.age_s + case.m.dt_s
     assert after.split.age_s == near(0.0 if taken else age)
-    fading = math.exp(-age / case.settings.reversal_s) if taken else 1.0
-    moved = after.split.decided_share - before.decided_share
-    assert after.split.recent_change == near(before.recent_change * fading + moved)
+    # No budget in these tables: nothing is counted, and nothing leaks.
+    assert after.split.changes_used == before.changes_used
+    assert after.split.jitter.taken >= before.jitter.taken
 
 
 CHECKS = (
@@ -591,20 +595,20 @@ def test_the_split_is_decided_once_a_period(dt, period, taken):
     assert steps == list(taken)
 
 
-def test_the_law_remembers_what_it_changed_just_now_and_is_slow_to_take_it_back():
+def test_no_minute_sees_more_changes_than_the_budget_and_one_bucket_whatever_is_demanded():
     table = load_policy(share_path("policies/jalalmaab_2015_none_coupled_mu090.npz")).table()
-    s, car, m = DEFAULT._replace(strategy=SDP_LOOKAHEAD), CARS["none"], measurement(speed=10.0, demand=1000.0)
-
-    def decided(recent, age_s=0.02):
-        before = memory(age_s=age_s, recent_change=recent)
-        return law.step(m, before, s, car, table)[0].decided_share
-
-    free = decided(0.0)
-    assert free in (0.0, 1.0), "one axle alone is best here"
-    back = math.copysign(0.5, 0.5 - free)
-    assert decided(back) == 1.0 - free, "it came from there just now; the other axle alone is nearly as good"
-    assert decided(-back) == free
-    assert decided(back, 30.0) == free, "forgotten"
+    s, car = DEFAULT._replace(strategy=SDP_LOOKAHEAD), CARS["none"]
+    state, share, changes = initial_state(), 0.5, []
+    # The demand leaps between what one axle and what both are best for, slowly enough to be no noise.
+    for k in range(18_000):
+        demand = 1000.0 if k // 60 % 2 else 14000.0
+        command, state = law.step(measurement(speed=10.0, demand=demand), state, s, car, table)
+        if abs(command.decided_share - share) > 0.25:
+            changes.append(k * 0.01)
+            share = command.decided_share
+    busiest = max(sum(start <= at < start + 60.0 for at in changes) for start in changes)
+    assert 5 < busiest <= 8.0 + 1.5 * 8.0
+    assert len(changes) <= 3 * 8.0 + 1.5 * 8.0
 
 
 def test_equal_split_at_ease_gives_each_motor_a_quarter():

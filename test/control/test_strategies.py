@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iwm_power_manager.control import strategies
+from iwm_power_manager.control.persistence import no_jitter
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.split import decide
 from iwm_power_manager.control.strategies import STRATEGIES, instantaneous
@@ -50,6 +51,10 @@ def _solved(previous=(0.0, 0.5, 1.0)):
 
 TABLE = _solved()
 ONE_SHARE = _solved((0.0,))
+#: The same with a budget of changes, and what follows at dearer prices.
+BUDGETED = TABLE._replace(
+    changes_per_min=8.0, dearer_cost_j=np.stack([TABLE.expected_cost_j * 1.5, TABLE.expected_cost_j[::-1] * 2.0])
+)
 AXES = ("power_w", "speed_mps", "slip_front", "slip_rear", "previous_share")
 POWER = st.one_of(st.floats(2.0, 30e3), st.floats(-40e3, -2.0))
 SPEED = st.one_of(st.just(0.0), st.floats(0.0, 35.0))
@@ -57,14 +62,15 @@ SLIP = st.floats(-1.2, 0.9)
 SHARE = st.one_of(st.sampled_from(SHARES), st.floats(0.01, 0.99))
 
 
-def situation(power, speed=12.0, front=0.0, rear=0.0, previous=0.3, recent=0.0, friction=0.9, decisions=0):
+def situation(power, speed=12.0, front=0.0, rear=0.0, previous=0.3, used=0.0, friction=0.9, decisions=0):
     return Situation(
         power_demand_w=power,
         speed_mps=speed,
         front_slip=front,
         rear_slip=rear,
         previous_share=previous,
-        recent_change=recent,
+        changes_used=used,
+        jitter=no_jitter(),
         friction=friction,
         decisions=decisions,
     )
@@ -84,10 +90,9 @@ def table_share(power, speed, front, rear, previous, table):
     return STRATEGIES["sdp"].choose(at, default_settings("sdp"), CAR, table)
 
 
-def lookahead_share(power, speed, front, rear, previous, tendency, car, table):
-    at = situation(power, speed, front, rear, previous, tendency)
-    tuning = default_settings("sdp_lookahead")._replace(reversal_price=1.0)
-    return STRATEGIES["sdp_lookahead"].choose(at, tuning, car, table)
+def lookahead_share(power, speed, front, rear, previous, used, car, table):
+    at = situation(power, speed, front, rear, previous, used)
+    return STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), car, table)
 
 
 def within_rounding(costs, ours, slack):
@@ -192,16 +197,17 @@ def test_a_share_from_a_table_stays_within_0_and_1():
     st.floats(-0.15, 0.15),
     st.floats(-0.15, 0.15),
     SHARE,
-    st.sampled_from([0.0, -7.0, 2.5]),
+    st.sampled_from([0.0, 1.9, 4.0, 8.0, 11.2, 12.0]),
 )
-def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, rear, previous, tendency):
+def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, rear, previous, used):
     def outcome(share):
         step = step_cost_and_next(power, speed, front, rear, share, CAR, TABLE.problem)
         return step.cost_j, step.speed_mps, step.slip_front, step.slip_rear
 
-    ours = lookahead_share(power, speed, front, rear, previous, tendency, CAR, TABLE)
-    costs = splits.bellman((power, speed, front, rear), previous, TABLE, outcome, tendency)
-    assert within_rounding(costs, ours, 1e-6)
+    for table in (TABLE, BUDGETED):
+        ours = lookahead_share(power, speed, front, rear, previous, used, CAR, table)
+        costs = splits.bellman((power, speed, front, rear), previous, table, outcome, used)
+        assert within_rounding(costs, ours, 1e-6)
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(2, 1.0), (2, -1.0), (3, 1.0), (3, -1.0)])
@@ -269,41 +275,50 @@ def test_the_lookahead_changes_for_a_saving_beyond_rounding():
     assert share(5e-5) == 0.1
 
 
-def test_a_change_that_was_just_made_is_dear_to_take_back_and_cheap_to_go_on_with():
-    # With nothing to follow and no fixed price, only the step's cost and the price of moving count.
-    table = TABLE._replace(expected_cost_j=TABLE.expected_cost_j * 0.0, discount=0.0, switching_fixed_cost_j=0.0)
+def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_is_none():
+    # With nothing to follow, only the step's cost and the price of the change count.
+    table = BUDGETED._replace(
+        expected_cost_j=BUDGETED.expected_cost_j * 0.0, dearer_cost_j=BUDGETED.dearer_cost_j * 0.0, discount=0.0
+    )._replace(switching_fixed_cost_j=0.0)
 
-    def moves(price, tendency):
-        """How far the share goes from 0.6, at 3 kW and 12 m/s, where one axle alone is best."""
-        return lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.6, tendency, CAR, table._replace(switching_cost_j=price)) - 0.6
+    def moves(price, used):
+        """Whether the share leaves 0.6, at 3 kW and 12 m/s, where one axle alone is best."""
+        return lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.6, used, CAR, table._replace(switching_cost_j=price)) != 0.6
 
-    free = moves(0.0, 0.0)
-    assert free != 0.0
-    tendency = -np.sign(free) * 4.0
-    price = next(p for p in np.geomspace(1e-3, 1e4, 200) if moves(p, tendency) == 0.0)
-    assert moves(price, 0.0) == free  # at once no, later yes
-    assert moves(price, -tendency) == free  # further the same way costs no more than ever
-
-
-def test_the_latest_changes_weigh_as_much_as_the_settings_say():
-    table = TABLE._replace(expected_cost_j=TABLE.expected_cost_j * 0.0, discount=0.0, switching_fixed_cost_j=0.0)
-    chosen = []
-    for price in np.geomspace(0.1, 1e3, 30):
-        for recent, weight in ((-0.4, 16.0), (0.4, 16.0), (0.4, 0.5), (0.0, 16.0)):
-            s = default_settings("sdp_lookahead")._replace(reversal_price=weight)
-            priced = table._replace(switching_cost_j=price)
-            ours = decide(situation(3000.0, previous=0.6, recent=recent), s, CAR, priced)
-            assert ours == lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.6, weight * recent, CAR, priced)
-            chosen.append((recent, weight, price, ours))
-    moved = {}
-    for recent, weight, _, ours in chosen:
-        moved[recent, weight] = moved.get((recent, weight), 0) + (ours != 0.6)
-    assert len(set(moved.values())) == 3, "held back a lot, a little, or not at all"
+    prices = np.geomspace(1e-3, 1e4, 200)
+    dearest = [max((p for p in prices if moves(p, used)), default=0.0) for used in (0.0, 2.0, 5.0, 9.0, 12.0)]
+    assert dearest[0] == dearest[1] > dearest[2] > dearest[3] > dearest[4] == 0.0
+    assert dearest[1] / dearest[3] == pytest.approx(3.0 ** (2.0 * (9.0 / 12.0 - 1 / 6) / (0.78 - 1 / 6)), rel=0.15)
 
 
-def choose(strategy, power=1500.0, decisions=0, previous=0.3, speed=12.0, friction=0.9, recent=0.0):
+def test_a_demand_that_jitters_is_judged_by_the_mean_of_what_it_jitters_between():
+    high, low, previous = 9000.0, 800.0, 0.5
+    free = TABLE._replace(discount=0.0, switching_cost_j=1.0, switching_fixed_cost_j=0.0)
+    gain = 0.4
+    jitter = no_jitter()._replace(samples_w=(low, high) * 5, taken=20, gain=gain)
+
+    def outcome(power):
+        return {share: step_cost_and_next(power, 12.0, 0.0, 0.0, share, CAR, free.problem).cost_j for share in SHARES}
+
+    weights = [gain * (1.0 - gain) ** age for age in range(11)]
+    costs = dict.fromkeys(SHARES, 0.0)
+    for weight, power in zip(weights, (high, *(low, high) * 5), strict=True):
+        for share, cost in outcome(power).items():
+            costs[share] += weight / sum(weights) * cost
+    for share in SHARES:
+        costs[share] += abs(share - previous)
+    at = situation(high, previous=previous)._replace(jitter=jitter)
+    ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, free)
+    assert within_rounding(costs, ours, 1e-6)
+    steady = STRATEGIES["sdp_lookahead"].choose(
+        at._replace(jitter=jitter._replace(gain=1.0)), default_settings("sdp_lookahead"), CAR, free
+    )
+    assert steady == lookahead_share(high, 12.0, 0.0, 0.0, previous, 0.0, CAR, free)
+
+
+def choose(strategy, power=1500.0, decisions=0, previous=0.3, speed=12.0, friction=0.9, used=0.0):
     s = default_settings(strategy)
-    return decide(situation(power, speed, 0.01, -0.02, previous, recent, friction, decisions), s, CAR, TABLE)
+    return decide(situation(power, speed, 0.01, -0.02, previous, used, friction, decisions), s, CAR, TABLE)
 
 
 def test_every_strategy_is_behind_its_name():

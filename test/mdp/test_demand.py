@@ -225,7 +225,7 @@ def test_a_recording_of_a_cycle_gives_the_cycle_s_chain():
 
 
 def _by_speed(**changes):
-    problem = load_problem(share_path("config/grids/coupled.yaml"))
+    problem = load_problem(share_path("config/grids/coupled.yaml")).for_car(CAR)
     axes = {"power_w": AXIS, "speed_mps": np.array([0.0, 10.0, 20.0])}
     return dataclasses.replace(problem, **{**axes, **changes})
 

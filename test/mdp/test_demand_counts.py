@@ -22,6 +22,7 @@ from iwm_power_manager.mdp.demand_counts import (
 )
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
 
 POWER_W = np.array([-2000.0, -500.0, 0.0, 1000.0, 3000.0])
 SPEED_MPS = np.array([0.0, 2.0, 10.0])
@@ -107,10 +108,11 @@ def test_walks_make_each_transition_as_often_as_it_was_counted(seed: int, size: 
 
 
 def test_the_solver_gets_the_same_chain_as_from_the_drive_itself(tmp_path: Path) -> None:
-    problem = load_problem(share_path("config/grids/coupled.yaml"))
+    car = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+    problem = load_problem(share_path("config/grids/coupled.yaml")).for_car(car)
     draw = np.random.default_rng(7)
     # On the axes' points, so that nothing is rounded on the way.
-    power = problem.power_w[np.clip(np.cumsum(draw.integers(-3, 4, 3000)) % 101, 0, 100)]
+    power = problem.power_w[np.clip(np.cumsum(draw.integers(-3, 4, 3000)) % problem.power_w.size, 0, None)]
     speed = problem.speed_mps[np.cumsum(draw.integers(0, 2, 3000)) % problem.speed_mps.size]
     count = DemandCounter(problem.power_w, problem.speed_mps, problem.dt_s)
     for k in range(power.size):

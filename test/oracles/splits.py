@@ -81,16 +81,33 @@ def interpolated(axes, table, point):
     return float(RegularGridInterpolator([axes[i] for i in kept], values)(inside)[0]) if kept else float(values)
 
 
-def bellman(point, previous, table, outcome, tendency=0.0):
-    """Cost of each share: step, change, and what follows (eq. 31). `outcome(share)` is the step's (cost, v, f, r)."""
+def price_units(move):
+    """What a move costs, in prices of a change: the mean of three ways of counting it."""
+    return 0.0 if move == 0.0 else (1.0 + min(abs(move) / 0.25, 1.0) + abs(move)) / 3.0
+
+
+def bellman(point, previous, table, outcome, used=0.0):
+    """Cost of each share: step, change, and what follows (eq. 31). `outcome(share)` is the step's (cost, v, f, r).
+
+    `used` is what is used of the budget of changes: the tables at dearer prices count for more, the more that is.
+    """
     axes = (table.power_w, table.speed_mps, table.slip_front, table.slip_rear, table.previous_share)
+    budget = table.changes_per_min
+    tables, level, factor = [table.expected_cost_j, *table.dearer_cost_j], 0.0, 1.0
+    if budget > 0.0:
+        full = max(1.5 * budget, 1.0)
+        level = float(np.interp(used / full, [1.0 / 6.0, 0.78], [0.0, 2.0]))
+        factor = 3.0**level
     costs = {}
     for share in (previous, *table.share):
         cost, speed, front, rear = outcome(share)
-        follow_up = interpolated(axes, table.expected_cost_j, (point[0], speed, front, rear, share))
+        at = (point[0], speed, front, rear, share)
+        follow_up = np.interp(level, range(len(tables)), [interpolated(axes, each, at) for each in tables])
         move = share - previous
-        back = abs(move * tendency) if move * tendency < 0.0 else 0.0
-        changed = table.switching_cost_j * (abs(move) + back) + table.switching_fixed_cost_j * (move != 0.0)
+        if budget > 0.0 and move != 0.0 and used + min(abs(move) / 0.25, 1.0) > full:
+            continue
+        units = price_units(move) if budget > 0.0 else abs(move)
+        changed = factor * table.switching_cost_j * units + table.switching_fixed_cost_j * (move != 0.0)
         costs.setdefault(share, cost + changed + table.discount * follow_up)
     costs[previous] -= TELLS_APART_W * table.problem.dt_s
     return costs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -101,11 +102,17 @@ def test_a_cycle_s_demand_is_a_driver_s_where_the_grid_says_so(grid, tmp_path):
 
 
 def test_the_shipped_policies_are_of_the_shipped_grid():
-    coupled = load_problem(share_path("config/grids/coupled.yaml"))
+    vehicle = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+    coupled = load_problem(share_path("config/grids/coupled.yaml")).for_car(vehicle)
     policies = [load_policy(path) for path in sorted(share_path("policies").glob("*.npz"))]
     assert len(policies) == 6
     for policy in policies:
-        assert policy.problem.settings() == coupled.on_road(policy.friction).settings()
+        # The price of a change is the solver's: the one that keeps the budget.
+        price = policy.problem.switching_cost_j
+        assert policy.problem.settings() == dataclasses.replace(coupled, switching_cost_j=price).settings()
+        found = {trial.price_j: trial.changes_per_min for trial in policy.trials}
+        assert found[price] == pytest.approx(coupled.changes_per_min, rel=0.031)
+        assert policy.dearer_cost_j.shape == (2, *policy.problem.shape)
 
 
 def test_the_same_inputs_give_the_same_bytes(grid, tmp_path):

@@ -1,13 +1,16 @@
 """`sdp_lookahead`: one step of Bellman's equation at the continuous state, with the solved cost-to-go.
 
-It minimises the cost of the next step plus the expected cost of all that follows: no rounding to grid points. What it
-changed just now it is slow to take back.
+It minimises the cost of the next step plus the expected cost of all that follows: no rounding to grid points. A change
+costs what the budget of changes makes it (`control.budget`), and what is noise of the demand is averaged out
+(`control.persistence`).
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from iwm_power_manager.control.budget import DEAREST, affordable, price_level, price_units
+from iwm_power_manager.control.persistence import SAMPLES
 from iwm_power_manager.control.strategies.instantaneous import LEAST_DIFFERENCE_W
 from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import PolicyTable
@@ -20,17 +23,27 @@ if TYPE_CHECKING:
     from iwm_power_manager.control.settings import Settings
 
 
+#: From this gain on a demand counts as it is: averaging would change nothing that matters.
+_LASTING = 0.99
+
+
 @kernel
 def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, policy: PolicyTable) -> float:
-    """Share that minimises eq. 31. A change against the latest ones costs more, by `reversal_price`."""
+    """Share that minimises eq. 31, among those whose change the budget can afford."""
     previous = situation.previous_share
-    tendency = settings.reversal_price * situation.recent_change
+    used = situation.changes_used
+    level = price_level(used, policy.changes_per_min) if policy.dearer_cost_j.shape[0] > 0 else 0.0
+    price = policy.switching_cost_j * (DEAREST ** (level / policy.dearer_cost_j.shape[0]) if level > 0.0 else 1.0)
+    budgeted = policy.changes_per_min > 0.0
     best = previous
-    best_cost = _cost_j(situation, previous, 0.0, vehicle, policy) - LEAST_DIFFERENCE_W * policy.problem.dt_s
+    best_cost = _cost_j(situation, previous, level, vehicle, policy) - LEAST_DIFFERENCE_W * policy.problem.dt_s
     for k in range(policy.share.size):
         share = policy.share[k]
-        against = max(-tendency if share > previous else tendency, 0.0)
-        cost = _cost_j(situation, share, against, vehicle, policy)
+        move = share - previous
+        if move == 0.0 or not affordable(move, used, policy.changes_per_min):
+            continue
+        switching = price * (price_units(move) if budgeted else abs(move)) + policy.switching_fixed_cost_j
+        cost = _cost_j(situation, share, level, vehicle, policy) + switching
         if cost < best_cost:
             best_cost = cost
             best = share
@@ -38,10 +51,34 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
 
 
 @kernel
-def _cost_j(situation: Situation, share: float, dearer: float, vehicle: VehicleParams, policy: PolicyTable) -> float:
-    """Right-hand side of eq. 31 for one share, J; `dearer` adds that part to the price of the change."""
+def _cost_j(situation: Situation, share: float, level: float, vehicle: VehicleParams, policy: PolicyTable) -> float:
+    """Cost of a step with this share and of all that follows, J, in the mean over what the demand jitters between."""
+    gain = situation.jitter.gain
+    now = _demand_cost_j(situation.power_demand_w, situation, share, level, vehicle, policy)
+    if gain > _LASTING:
+        return now
+    total = gain * now
+    weights = gain
+    weight = gain
+    for i in range(min(SAMPLES, situation.jitter.taken)):
+        weight *= 1.0 - gain
+        total += weight * _demand_cost_j(situation.jitter.samples_w[i], situation, share, level, vehicle, policy)
+        weights += weight
+    return total / weights
+
+
+@kernel
+def _demand_cost_j(
+    power_demand_w: float,
+    situation: Situation,
+    share: float,
+    level: float,
+    vehicle: VehicleParams,
+    policy: PolicyTable,
+) -> float:
+    """Right-hand side of eq. 31 for one demand and one share, J, without the price of the change."""
     outcome = step_cost_and_next(
-        situation.power_demand_w,
+        power_demand_w,
         situation.speed_mps,
         situation.front_slip,
         situation.rear_slip,
@@ -49,16 +86,20 @@ def _cost_j(situation: Situation, share: float, dearer: float, vehicle: VehicleP
         vehicle,
         policy.problem,
     )
-    a, fa = locate(policy.power_w, situation.power_demand_w)
+    a, fa = locate(policy.power_w, power_demand_w)
     b, fb = locate(policy.speed_mps, outcome.speed_mps)
     c, fc = locate(policy.slip_front, outcome.slip_front)
     d, fd = locate(policy.slip_rear, outcome.slip_rear)
     e, fe = locate(policy.previous_share, share)
-    follow_up = interpolate5(policy.expected_cost_j, a, fa, b, fb, c, fc, d, fd, e, fe)
-    switching = policy.switching_cost_j * (1.0 + dearer) * abs(share - situation.previous_share)
-    if share != situation.previous_share:
-        switching += policy.switching_fixed_cost_j
-    return outcome.cost_j + switching + policy.discount * follow_up
+    if level <= 0.0:
+        follow_up = interpolate5(policy.expected_cost_j, a, fa, b, fb, c, fc, d, fd, e, fe)
+    else:
+        upper = min(int(level), policy.dearer_cost_j.shape[0] - 1)
+        low = policy.expected_cost_j if upper == 0 else policy.dearer_cost_j[upper - 1]
+        follow_up = interpolate5(low, a, fa, b, fb, c, fc, d, fd, e, fe)
+        high = interpolate5(policy.dearer_cost_j[upper], a, fa, b, fb, c, fc, d, fd, e, fe)
+        follow_up += (level - upper) * (high - follow_up)
+    return outcome.cost_j + policy.discount * follow_up
 
 
 STRATEGY = Strategy("sdp_lookahead", 5, choose, needs_policy=True)

@@ -1,0 +1,69 @@
+"""The budget of changes: what a change of the share counts as, what it costs, and what it costs when little is left.
+
+A change is counted in three ways, so that no strategy can win one count at the cost of another: any change counts as
+one; one by a quarter of the power or more counts as one, a smaller one in proportion; and a move counts as its length.
+The price of a change goes by the mean of the three. What is budgeted is the second: it is never less than the number of
+changes by more than a quarter, and swinging just around that is no way out.
+
+Every change fills a bucket that leaks at the rate of the budget. A share whose change does not fit is not offered: so
+no minute sees more than the budget and one bucket, and no hour more than sixty budgets and one bucket, whatever is
+driven. Long before it comes to that, the price rises with the level: being stuck with a share costs far more than a
+change that was not worth it. At `DEAREST` times the price hardly any change pays, and the bucket is not full yet.
+"""
+
+from __future__ import annotations
+
+from iwm_power_manager.jit import kernel
+
+#: A change of the share by this much, or more, counts as one.
+WHOLE_CHANGE = 0.25
+#: Prices of a change at which the solver tabulates the cost-to-go beside its own, as multiples of it.
+DEARER = (3.0, 9.0)
+DEAREST = DEARER[-1]
+
+
+#: The bucket holds this many minutes' budget, one change at least.
+BUCKET_MIN = 1.5
+#: Level, as part of the bucket, up to which the price stays; and from which on it is `DEAREST` times as high.
+CALM, FULL_PRICE = 1.0 / 6.0, 0.78
+
+
+@kernel
+def changes_counted(move: float) -> float:
+    """What a move of the share takes from the budget, 0..1."""
+    return min(abs(move) / WHOLE_CHANGE, 1.0)
+
+
+@kernel
+def price_units(move: float) -> float:
+    """What a move of the share costs, in prices of a change, 0..1."""
+    if move == 0.0:
+        return 0.0
+    return (1.0 + changes_counted(move) + abs(move)) / 3.0
+
+
+@kernel
+def bucket(changes_per_min: float) -> float:
+    """Changes the bucket holds."""
+    return max(BUCKET_MIN * changes_per_min, 1.0)
+
+
+@kernel
+def leaked(used: float, seconds: float, changes_per_min: float) -> float:
+    """Changes still counted as used after a time."""
+    return max(used - changes_per_min / 60.0 * seconds, 0.0)
+
+
+@kernel
+def affordable(move: float, used: float, changes_per_min: float) -> bool:
+    """Whether the bucket has room for a move of the share. Without a budget everything is."""
+    return changes_per_min <= 0.0 or move == 0.0 or used + changes_counted(move) <= bucket(changes_per_min)
+
+
+@kernel
+def price_level(used: float, changes_per_min: float) -> float:
+    """Where the price stands between the tabulated ones: 0 the solver's, 1 and 2 those of `DEARER`; in proportion."""
+    if changes_per_min <= 0.0:
+        return 0.0
+    rise = (used / bucket(changes_per_min) - CALM) / (FULL_PRICE - CALM)
+    return min(max(rise, 0.0), 1.0) * len(DEARER)

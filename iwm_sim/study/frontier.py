@@ -1,0 +1,211 @@
+"""The frontier: what a strategy saves, against how often it changes the split to do so.
+
+A saving alone says little: changing at every glimpse of a gain saves more than a strategy that a driver would want.
+So a strategy is compared at the same number of changes: `instantaneous_slip` over thresholds, ours over budgets, in
+the closed loop, on one `Place` (car, cycle, road, noise). Changes are counted in three ways, because a strategy could
+win one count by cheating on it: changes by more than a quarter of the power, changes by more than a twentieth, and the
+sum of all moves. The `margin` of a point is its saving minus the best a rival reaches with no more changes; equal
+split, which saves nothing and never changes, is always among the rivals.
+
+`bound` is what could be saved with the whole drive known in advance and no more changes: dynamic programming over the
+demand, with the price of a change bisected until the changes fit (a Lagrangian), driven like any other strategy. What
+another strategy did can be known in advance as well, so the bound is never below what any strategy reached.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from iwm_power_manager.control.settings import default_settings
+from iwm_power_manager.control.table import PolicyTable, empty_table
+from iwm_power_manager.cycle import Cycle
+from iwm_power_manager.vehicle import Vehicle
+from iwm_sim import closed_loop, preview
+from iwm_sim.closed_loop import Noise, Run
+from iwm_sim.metrics import Metrics, measure, share_changes
+from iwm_sim.study import generate
+from iwm_sim.study.rows import saving_percent
+
+FloatArray = npt.NDArray[np.float64]
+
+#: Thresholds of `instantaneous_slip`, W.
+THRESHOLDS_W = (0.0, 5.0, 10.0, 15.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0, 140.0, 200.0)
+#: Budgets of ours, changes a minute; the last one is as good as none.
+BUDGETS_PER_MIN = (2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 14.0, 20.0, 1000.0)
+OURS = "sdp_lookahead"
+RIVAL = "instantaneous_slip"
+
+#: Ways of counting changes, by the field of `Point`.
+COUNTS = ("changes_per_min", "fine_changes_per_min", "travel_per_min")
+FINE_CHANGE = 0.05
+
+_DT_S = 0.01
+_BISECTIONS = 12
+
+
+class Place(NamedTuple):
+    """Where a frontier is measured.
+
+    Attributes
+    ----------
+    label : what tables call it
+    vehicle, cycle, friction : what is driven
+    noise_seed : of a foot that shakes by 1 % of the pedal's travel; None is a steady one
+    """
+
+    label: str
+    vehicle: Vehicle
+    cycle: Cycle
+    friction: float
+    noise_seed: int | None = None
+
+
+class Point(NamedTuple):
+    """One drive: what it saved against equal split, and with how many changes.
+
+    Attributes
+    ----------
+    strategy, setting : threshold in W, or budget in changes a minute
+    saving_percent : None where the runs do not cover the same distance
+    changes_per_min : by more than a quarter
+    fine_changes_per_min : by more than a twentieth
+    travel_per_min : sum of all moves, 1 being all the power
+    busiest_minute : most changes in any minute
+    held : whether this run and that of equal split held the trace
+    """
+
+    strategy: str
+    setting: float
+    saving_percent: float | None
+    changes_per_min: float
+    fine_changes_per_min: float
+    travel_per_min: float
+    busiest_minute: int
+    held: bool
+
+
+class Frontier(NamedTuple):
+    """All points of a place; `bound` has no more changes than the point of ours it stands for."""
+
+    label: str
+    rivals: tuple[Point, ...]
+    ours: tuple[Point, ...]
+    bounds: tuple[Point, ...]
+
+
+class _Reference(NamedTuple):
+    run: Run
+    metrics: Metrics
+
+
+def drive(place: Place, strategy: str, table: PolicyTable, threshold_w: float = 0.0) -> Run:
+    """Drive a place with a strategy."""
+    noise = closed_loop.NO_NOISE
+    if place.noise_seed is not None:
+        steps = int(place.cycle.duration_s / _DT_S) + 2
+        noise = Noise(np.zeros(steps), np.zeros((steps, 4)), generate.pedal_noise(steps, _DT_S, place.noise_seed))
+    settings = default_settings(strategy)._replace(switching_power_w=threshold_w)
+    return closed_loop.run(place.cycle, place.vehicle, settings, table, place.friction, dt_s=_DT_S, noise=noise)
+
+
+def busiest_minute(share: FloatArray, dt_s: float) -> int:
+    """Most changes by more than a quarter in any 60 s."""
+    level = share[0]
+    at = []
+    for k in np.flatnonzero(np.diff(share, prepend=share[0])):
+        if abs(share[k] - level) > 0.25:
+            at.append(k * dt_s)
+            level = share[k]
+    times = np.array(at)
+    return int(max((np.count_nonzero((times >= t) & (times < t + 60.0)) for t in times), default=0))
+
+
+def _point(strategy: str, setting: float, run: Run, place: Place, reference: _Reference) -> Point:
+    metrics = measure(run, place.vehicle.params)
+    minutes = run.series.shape[0] * run.dt_s / 60.0
+    share = run["decided_share"]
+    return Point(
+        strategy=strategy,
+        setting=setting,
+        saving_percent=saving_percent(metrics, reference.metrics),
+        changes_per_min=metrics.share_changes_per_min,
+        fine_changes_per_min=share_changes(share, FINE_CHANGE) / minutes,
+        travel_per_min=metrics.share_travel_per_min,
+        busiest_minute=busiest_minute(share, run.dt_s),
+        held=metrics.trace_held and reference.metrics.trace_held,
+    )
+
+
+def measure_frontier(
+    place: Place,
+    policies: Sequence[tuple[float, PolicyTable]],
+    thresholds_w: Sequence[float] = THRESHOLDS_W,
+    bounds: bool = False,
+) -> Frontier:
+    """Drive a place with all strategies.
+
+    Parameters
+    ----------
+    policies : of ours: budget in changes a minute, and the policy solved for it
+    thresholds_w : of the rival
+    bounds : whether to look for the bound of each of our points as well
+    """
+    equal = drive(place, "equal", empty_table())
+    reference = _Reference(equal, measure(equal, place.vehicle.params))
+    rivals = [
+        _point(RIVAL, threshold, drive(place, RIVAL, empty_table(), threshold), place, reference)
+        for threshold in thresholds_w
+    ]
+    blind = drive(place, "instantaneous", empty_table())
+    rivals.append(_point("instantaneous", 0.0, blind, place, reference))
+    ours, limits = [], []
+    for budget, table in policies:
+        run = drive(place, OURS, table)
+        ours.append(_point(OURS, budget, run, place, reference))
+        if bounds:
+            limits.append(_bound(place, reference, run, [*rivals, ours[-1]], ours[-1]))
+    return Frontier(place.label, tuple(rivals), tuple(ours), tuple(limits))
+
+
+def margin(point: Point, rivals: Sequence[Point], count: str) -> float | None:
+    """Saving of a point minus the best of its rivals with no more changes, in points; None where there is no saving."""
+    if point.saving_percent is None or not point.held:
+        return None
+    within = getattr(point, count) + 1e-9
+    best = max(
+        (r.saving_percent for r in rivals if r.held and r.saving_percent is not None and getattr(r, count) <= within),
+        default=0.0,
+    )
+    return point.saving_percent - max(best, 0.0)
+
+
+def _bound(place: Place, reference: _Reference, ours: Run, others: Sequence[Point], point: Point) -> Point:
+    """The best of all schedules tried that change no more often than a point of ours, and of what strategies did."""
+    found = [p for p in others if p.saving_percent is not None and p.changes_per_min <= point.changes_per_min + 1e-9]
+    for run in (reference.run, ours):
+        share = _schedule(place, run, point.changes_per_min)
+        table = empty_table(schedule=share.tolist())
+        found.append(_point("preview", point.setting, drive(place, "preview", table), place, reference))
+    best = max(found, key=lambda p: -np.inf if p.saving_percent is None else p.saving_percent)
+    return best._replace(strategy="preview", setting=point.setting)
+
+
+def _schedule(place: Place, run: Run, changes_per_min: float) -> FloatArray:
+    """The cheapest schedule for the demand of a run with at most so many changes a minute."""
+    most = changes_per_min * run.series.shape[0] * run.dt_s / 60.0 + 1e-6
+    period = default_settings().decision_period_s
+    demand, speed = run["power_demand_w"], run["speed_mps"]
+    share = empty_table().share
+    cost = preview.step_costs(demand, speed, run.dt_s, period, place.vehicle.params, place.friction, share)
+    low, high = 1e-2, 1e6
+    for _ in range(_BISECTIONS):
+        price = float(np.sqrt(low * high))
+        if share_changes(preview.cheapest_schedule(cost, share, price)) > most:
+            low = price
+        else:
+            high = price
+    return preview.cheapest_schedule(cost, share, high)

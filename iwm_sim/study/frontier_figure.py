@@ -1,0 +1,74 @@
+"""Pictures of frontiers: saving against changes, and the margins of many cells."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from iwm_power_manager.files import atomic_write
+from iwm_sim.study.frontier import COUNTS, RIVAL, Frontier, Point, margin
+from iwm_sim.study.palette import COLOURS
+
+_NAMES = {
+    "changes_per_min": "changes by more than 0.25, 1/min",
+    "fine_changes_per_min": "changes by more than 0.05, 1/min",
+    "travel_per_min": "sum of all moves, 1/min",
+}
+
+
+def draw_frontier(frontier: Frontier, path: Path) -> None:
+    """Saving of ours, its rivals and the bound against each way of counting changes."""
+    figure, axes = plt.subplots(1, len(COUNTS), figsize=(12.0, 4.0), sharey=True, layout="constrained")
+    for axis, count in zip(axes, COUNTS, strict=True):
+        families = (
+            (f"{RIVAL}, thresholds", [p for p in frontier.rivals if p.strategy == RIVAL], COLOURS[1], "o-"),
+            ("instantaneous", [p for p in frontier.rivals if p.strategy != RIVAL], COLOURS[3], "s"),
+            ("ours, budgets", frontier.ours, COLOURS[0], "o-"),
+            ("known in advance", frontier.bounds, COLOURS[6], "x--"),
+        )
+        for name, points, colour, style in families:
+            _curve(axis, name, points, count, colour, style)
+        axis.set_xlabel(_NAMES[count])
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("saving against equal split, %")
+    axes[0].legend(frameon=False)
+    figure.suptitle(frontier.label)
+    _save(figure, path)
+
+
+def _curve(axis: Axes, name: str, points: Sequence[Point], count: str, colour: str, style: str) -> None:
+    known = sorted((getattr(p, count), p.saving_percent) for p in points if p.saving_percent is not None)
+    if known:
+        axis.plot(*zip(*known, strict=True), style, color=colour, label=name, markersize=4)
+
+
+def draw_margins(frontiers: Sequence[Frontier], path: Path) -> None:
+    """All cells' margins, sorted, for each way of counting changes."""
+    figure, axis = plt.subplots(figsize=(8.0, 4.0), layout="constrained")
+    for count, colour in zip(COUNTS, COLOURS, strict=False):
+        found = (margin(point, f.rivals, count) for f in frontiers for point in f.ours)
+        known = np.sort([value for value in found if value is not None])
+        axis.plot(np.linspace(0.0, 100.0, known.size), known, color=colour, label=_NAMES[count])
+    axis.axhline(-0.005, color=COLOURS[6], linewidth=0.8)
+    axis.set_yscale("symlog", linthresh=0.02)
+    axis.set_xlabel("cells, %")
+    axis.set_ylabel("saving minus the best rival's with no more changes, points")
+    axis.legend(frameon=False)
+    axis.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    stream = io.BytesIO()
+    figure.savefig(stream, format=path.suffix.removeprefix(".") or "svg")
+    plt.close(figure)
+    atomic_write(path, stream.getvalue())

@@ -1,0 +1,171 @@
+"""Frontiers of drives and cars that nobody chose: what our strategy is worth there, said with its worst cells.
+
+One setting for all: the default budget, the default grid, policies solved from the same three cycles as the shipped
+ones. A cell is one car, cycle, road and noise. `judge` turns cells into a distribution of margins, for each way of
+counting changes; cells whose trace was lost count as such and have no margin.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.mdp.demand import chain_of, source_of
+from iwm_power_manager.policy import load_policy
+from iwm_power_manager.share import resolve
+from iwm_power_manager.solve import load_grid, solve_one
+from iwm_power_manager.vehicle import Vehicle, load_vehicle
+from iwm_sim.study import generate
+from iwm_sim.study.frontier import COUNTS, Frontier, Place, margin, measure_frontier
+from iwm_sim.study.names import DEFAULT_GRID
+from iwm_sim.study.policies import TRAINING_CYCLES, solved
+
+#: Points of saving ours may be below a rival with no more changes, and the part of the cells in which it is to be so.
+CLOSE, PART = 0.005, 0.95
+WORST = 0.03
+FRICTIONS = (0.9, 0.5, 0.2)
+NOISE_KMH = (0.0, 0.05, 0.1, 0.2)
+CAR_CYCLES = 3
+
+
+class Cell(NamedTuple):
+    """What to drive: seeds, road and noise, which travel to a worker process; car -1 is the vehicle itself."""
+
+    vehicle: str
+    idle_drive: str
+    car: int
+    cycle: int
+    friction: float
+    noise_kmh: float | None
+
+    @property
+    def label(self) -> str:
+        """What tables call it."""
+        car = Path(self.vehicle).stem if self.car < 0 else f"car {self.car}"
+        noise = "" if self.noise_kmh is None else f", logged with {self.noise_kmh:g} km/h, foot shaking"
+        return f"{car}, cycle {self.cycle}, friction {self.friction:g}{noise}"
+
+
+def cells(vehicle: str, idle_drive: str, first_seed: int, cycles: int, cars: int) -> list[Cell]:
+    """Generated cycles on a car and on generated cars, on three roads in turn, each without and with noise."""
+    made = [(-1, first_seed + k, FRICTIONS[k % 3], NOISE_KMH[k % 4]) for k in range(cycles)]
+    for k in range(cars):
+        made += [
+            (first_seed + k, first_seed + CAR_CYCLES * k + i, FRICTIONS[(k + i) % 3], NOISE_KMH[(k + i) % 4])
+            for i in range(CAR_CYCLES)
+        ]
+    return [
+        Cell(vehicle, idle_drive, car, cycle, friction, noise)
+        for car, cycle, friction, rms in made
+        for noise in (None, rms)
+    ]
+
+
+def car_of(cell: Cell) -> Vehicle:
+    """The car of a cell."""
+    base = load_vehicle(resolve(cell.vehicle), cell.idle_drive or None)
+    if cell.car < 0:
+        return base
+    mapped = load_vehicle(resolve("jalalmaab_2015_map")).params.front.motor
+    return generate.car(cell.car, base, mapped._replace(idle_drive=base.params.front.motor.idle_drive))
+
+
+def place_of(cell: Cell) -> Place:
+    """Car, trace and road of a cell."""
+    cycle = generate.cycle(cell.cycle)
+    if cell.noise_kmh is None:
+        return Place(cell.label, car_of(cell), cycle, cell.friction)
+    logged = generate.logged(cycle, cell.noise_kmh, cell.cycle)
+    return Place(cell.label, car_of(cell), logged, cell.friction, noise_seed=cell.cycle)
+
+
+def drive_cell(cell: Cell) -> Frontier:
+    """The rivals, and ours at the default budget, on one cell."""
+    place = place_of(cell)
+    policy = load_policy(solved(place.vehicle, cell.friction, DEFAULT_GRID))
+    return measure_frontier(place, [(policy.problem.changes_per_min, policy.table())])
+
+
+def budgets_of(place: Place, budgets: Sequence[float], folder: Path) -> Frontier:
+    """The rivals, and ours solved anew for each budget, on one place, with the bound of each."""
+    policies = []
+    for budget in budgets:
+        problem = dataclasses.replace(load_grid(DEFAULT_GRID, place.vehicle.params), changes_per_min=budget)
+        sources = [source_of(load_cycle(resolve(name)), problem, place.vehicle.params) for name in TRAINING_CYCLES]
+        chain = chain_of(problem, sources)
+        made = solve_one(problem, place.vehicle, place.friction, chain, sources, folder / f"{budget:g}.npz")
+        policies.append((budget, made.policy.table()))
+    return measure_frontier(place, policies, bounds=True)
+
+
+class Verdict(NamedTuple):
+    """Margins of all cells in one way of counting, in points of saving."""
+
+    counted: str
+    cells: int
+    mean: float
+    lowest_twentieth: float
+    worst: float
+    part_close: float
+
+    @property
+    def reached(self) -> bool:
+        """Whether the target is: close in nearly all cells, never far below, above on average."""
+        return self.part_close >= PART and self.worst >= -WORST and self.mean > 0.0
+
+
+def judge(frontiers: Sequence[Frontier]) -> list[Verdict]:
+    """The distribution of the margins, for each way of counting changes."""
+    verdicts = []
+    for count in COUNTS:
+        found = [margin(point, f.rivals, count) for f in frontiers for point in f.ours]
+        known = np.array([value for value in found if value is not None])
+        if known.size:
+            low = float(np.quantile(known, 0.05))
+            close = float(np.mean(known >= -CLOSE))
+            verdicts.append(Verdict(count, known.size, float(known.mean()), low, float(known.min()), close))
+    return verdicts
+
+
+def report(frontiers: Sequence[Frontier], worst: int = 10) -> str:
+    """The verdicts and the worst cells, as text."""
+    lost = sum(not point.held for f in frontiers for point in f.ours)
+    lines = [f"{len(frontiers)} cells, {lost} of them without a held trace or an equal split that held it"]
+    lines += [
+        f"{verdict.counted}: {verdict.cells} cells, margin mean {verdict.mean:+.3f}, lowest twentieth below "
+        f"{verdict.lowest_twentieth:+.3f}, worst {verdict.worst:+.3f} points; no more than {CLOSE:g} below in "
+        f"{verdict.part_close:.1%}; target {'reached' if verdict.reached else 'NOT reached'}"
+        for verdict in judge(frontiers)
+    ]
+    known = [(margin(f.ours[0], f.rivals, COUNTS[0]), f) for f in frontiers]
+    ranked = sorted(((m, f) for m, f in known if m is not None), key=lambda pair: pair[0])
+    lines.append("worst cells: margin, saving %, changes/min, busiest minute")
+    for value, f in ranked[:worst]:
+        point = f.ours[0]
+        lines.append(
+            f"{value:+.3f}  {point.saving_percent:.3f}  {point.changes_per_min:.1f}  {point.busiest_minute}  {f.label}"
+        )
+    return "\n".join(lines)
+
+
+def to_json(frontiers: Sequence[Frontier]) -> bytes:
+    """Everything measured."""
+    content: dict[str, Any] = {
+        "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in judge(frontiers)],
+        "cells": [
+            {
+                "label": f.label,
+                "rivals": [point._asdict() for point in f.rivals],
+                "ours": [point._asdict() for point in f.ours],
+                "bounds": [point._asdict() for point in f.bounds],
+            }
+            for f in frontiers
+        ],
+    }
+    return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()

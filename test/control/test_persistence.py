@@ -1,0 +1,62 @@
+"""Noise of the demand is told from what lasts, and only where there is some."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from iwm_power_manager.control.persistence import Jitter, lasting_gain, no_jitter, observed
+
+
+def watched(demand_w: np.ndarray, step_s: float = 0.01) -> Jitter:
+    jitter = no_jitter()
+    for power in demand_w:
+        jitter = observed(jitter, float(power), step_s)
+    return jitter
+
+
+def kalman_gain(wander: float, noise: float) -> float:
+    """Steady gain by iterating the filter's variance."""
+    variance = 1.0
+    for _ in range(10_000):
+        predicted = variance + wander
+        gain = predicted / (predicted + noise)
+        variance = (1.0 - gain) * predicted
+    return gain
+
+
+@pytest.mark.parametrize(("wander", "noise"), [(1.0, 1.0), (0.5, 2.0), (3.0, 1.0)])
+def test_the_gain_is_the_kalman_filter_s(wander, noise):
+    assert lasting_gain(wander + 2.0 * noise, -noise) == pytest.approx(max(kalman_gain(wander, noise), 0.1), rel=1e-6)
+
+
+def test_a_demand_that_wanders_or_ramps_is_taken_as_it_is():
+    rng = np.random.default_rng(1)
+    jitter, taken_as_it_is = no_jitter(), 0
+    for power in np.cumsum(300.0 * rng.standard_normal(3000)):
+        jitter = observed(jitter, float(power), 0.1)
+        taken_as_it_is += jitter.gain == 1.0
+    assert taken_as_it_is > 0.85 * 3000  # two standard errors: by chance, a little of it looks like noise
+    assert watched(np.linspace(0.0, 9000.0, 3000)).gain == 1.0
+    assert watched(2000.0 * np.sin(np.arange(6000) * 0.01)).gain == 1.0
+
+
+def test_white_noise_on_a_steady_demand_is_averaged_over_a_second():
+    rng = np.random.default_rng(2)
+    noisy = 3000.0 + np.repeat(800.0 * rng.standard_normal(600), 10)
+    found = watched(noisy)
+    assert found.gain < 0.35
+    assert math.sqrt(-found.covariance_w2) == pytest.approx(800.0, rel=0.3)
+
+
+def test_the_latest_second_is_remembered_newest_first():
+    found = watched(np.arange(3000.0))
+    assert found.samples_w == tuple(2990.0 - 10.0 * age for age in range(10))
+    assert found.age_s == pytest.approx(0.09)
+
+
+def test_nothing_is_known_before_the_first_demand():
+    assert no_jitter().gain == 1.0 and no_jitter().taken == 0
+    assert observed(no_jitter(), 5.0, 0.01).samples_w[0] == 5.0
