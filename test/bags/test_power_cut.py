@@ -127,7 +127,7 @@ def cut_and_recover(journal: Journal, bag: Path, given: dict[int, int], cuts: in
                         kept.append(message.publish_time_ns)
                     assert reader.damage == []
             except BagError as error:  # not even the head of the first file is there
-                assert "nothing to recover" in str(error) or "holds no .mcap file" in str(error)  # noqa: PT017
+                assert "nothing to recover" in str(error) or "holds no .mcap or .db3 file" in str(error)  # noqa: PT017
         assert kept == sorted(set(kept))
         missing = given.keys() - set(kept)
         lost_s = max((at_ns - given[number] for number in missing if given[number] <= at_ns), default=0) * 1e-9

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import random
 import signal
@@ -15,6 +16,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from iwm_power_manager.bags.reader import BagReader
@@ -127,7 +129,10 @@ def test_one_damaged_byte_anywhere_never_makes_up_a_message(
 
 def test_a_damaged_chunk_is_left_out_named_and_the_original_kept(tmp_path: Path, whole: bytes) -> None:
     content = bytearray(whole)
-    content[len(content) // 2] ^= 0xFF
+    summary = make_reader(io.BytesIO(whole)).get_summary()
+    assert summary is not None
+    chunk = summary.chunk_indexes[len(summary.chunk_indexes) // 2]
+    content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
     path = broken_bag(tmp_path, bytes(content))
     report = recover(path)
     assert report.files[0].lost_chunks == 1
