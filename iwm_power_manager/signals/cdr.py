@@ -170,11 +170,12 @@ class MessageReader[T]:
         """
         layout = self._layouts.get(len(data))
         if layout is not None:
-            found = layout.unpack(data)
-            if layout.same(found) == layout.seen:
+            unpack, same, seen, pick, names = layout
+            found = unpack(data)
+            if same(found) == seen:
                 if self.stamped:
                     time_ns = found[1] * _NS_PER_S + found[2]
-                return self._make(time_ns, layout.pick(found), layout.names)
+                return self._make(time_ns, pick(found), names)
         return self._make(*self._decode(data, time_ns))
 
     def _decode(self, data: bytes, time_ns: int) -> tuple[int, tuple[Any, ...], tuple[str, ...]]:

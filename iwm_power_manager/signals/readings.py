@@ -246,8 +246,12 @@ def _topic_reader(file: Path, types: Types, found: list[tuple[str, int, Source]]
 
 
 def _together(binds: list[_Bind]) -> _Bind:
-    if len(binds) == 1:
-        return binds[0]
+    first, *rest = binds
+    if not rest:
+        return first
+    second, *rest = rest
+    if not rest:
+        return lambda time_ns, values, names: first(time_ns, values, names) + second(time_ns, values, names)
 
     def all_of_them(time_ns: int, values: tuple[Any, ...], names: tuple[str, ...]) -> tuple[Reading, ...]:
         return tuple([reading for bind in binds for reading in bind(time_ns, values, names)])
@@ -331,6 +335,7 @@ def _bind_wheels(
     """Four wheels in one message: by name, under the controller's names, or as an array in the right order."""
     ours = dict(zip(source.names, assembly.wheel_names, strict=True)) if source.names else {}
     signs = dict(zip(source.names or assembly.wheel_names, source.signs, strict=True)) if source.signs else {}
+    ordered = assembly.wheel_names
     seen: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
     turned: tuple[float, ...] = ()
@@ -339,7 +344,7 @@ def _bind_wheels(
         nonlocal seen, known, turned
         speeds = values[place]
         if not ours:
-            names = assembly.wheel_names
+            names = ordered
         if names is not seen:  # the reader gives the same object for the same names
             seen, known = names, tuple(ours.get(name, name) for name in names) if ours else names
             turned = tuple(signs.get(name, 1.0) for name in names) if signs else ()
