@@ -112,6 +112,6 @@ def test_a_wheel_that_is_missing_is_named_whatever_the_order_of_the_message(tmp_
         bag.write(bag.add_topic(topic("/wheel_states", JOINT_STATE)), 1, data)
     with BagReader(tmp_path / "bag") as reader:
         stream = SignalStream(reader, load_mapping())
-        (found,) = list(stream)
+        found = next(iter(stream))
     assert found.reading.names == tuple(names)
     assert list(stream.without) == ["/wheel_states: front_left"]

@@ -58,7 +58,7 @@ def test_the_log_tells_the_way_from_start_to_end(start_pair) -> None:
     refused = "bench asks for another quality of service"
     bench.drive(lambda: lines_with(running, refused), "the subscriber that cannot hear")
     bench.drive(
-        lambda: lines_with(running, "degraded, motor torque fades: battery_state"),
+        lambda: any("battery_state" in line for line in lines_with(running, "degraded, motor torque fades: ")),
         "the degraded state",
         without=(messages.BATTERY_STATE,),
     )
