@@ -87,11 +87,18 @@ def _turned(values, name):
 
 
 @pytest.mark.parametrize(
-    ("car", "idle_drive"),
-    [(CAR, IDLE_NONE), (CAR, IDLE_DRAG), (CAR, IDLE_ENABLED), (MAPPED, IDLE_DRAG)],
-    ids=["none", "drag", "enabled", "map"],
+    ("car", "idle_drive", "axles"),
+    [
+        (CAR, IDLE_NONE, "both"),
+        (CAR, IDLE_DRAG, "both"),
+        (CAR, IDLE_ENABLED, "both"),
+        (MAPPED, IDLE_DRAG, "both"),
+        (CAR, IDLE_DRAG, "front"),
+        (CAR, IDLE_DRAG, "rear"),
+    ],
+    ids=["none", "drag", "enabled", "map", "front", "rear"],
 )
-def test_a_number_counts_for_a_policy_exactly_if_the_solver_s_tables_change_with_it(car, idle_drive):
+def test_a_number_counts_for_a_policy_exactly_if_the_solver_s_tables_change_with_it(car, idle_drive, axles):
     base = _tight(car.params, idle_drive)
     identity = with_params(car, "tight", base).hash
     tables = _tables(base)
@@ -99,8 +106,11 @@ def test_a_number_counts_for_a_policy_exactly_if_the_solver_s_tables_change_with
     for section, name in _numbers(base):
         if section in base._fields:
             turned = base._replace(**{section: _turned(getattr(base, section), name)})
-        else:
+        elif axles == "both":
             turned = base.with_axles(**{section: _turned(getattr(base.front, section), name)})
+        else:
+            axle = getattr(base, axles)
+            turned = base._replace(**{axles: axle._replace(**{section: _turned(getattr(axle, section), name)})})
         counts = with_params(car, "turned", turned).hash != identity
         if counts == _same(tables, _tables(turned)):
             wrong.append(f"{section}.{name} {'counts and is not read' if counts else 'is read and does not count'}")

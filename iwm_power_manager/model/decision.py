@@ -13,7 +13,7 @@ from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.gate import axle_gated, gated_split
-from iwm_power_manager.model.limits import battery_scale, car_power_w
+from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
 from iwm_power_manager.model.longitudinal import step
 from iwm_power_manager.model.motor import idle_drag_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
@@ -160,24 +160,20 @@ def step_cost_and_next(
 
 @kernel
 def _axle_torque(
-    power_w: float, wheel_speed_radps: float, speed_mps: float, vehicle: VehicleParams, problem: ProblemParams
+    power_w: float, wheel_speed_radps: float, speed_mps: float, axle: Axle, floor_mps: float, problem: ProblemParams
 ) -> tuple[float, float, float]:
     """Motor and friction torque of one wheel for its axle's power, and the axle's power beyond the motor's limit."""
     conversion = conversion_speed_radps(
-        wheel_speed_radps,
-        speed_mps,
-        problem.critical_slip,
-        vehicle.front.wheel.radius_m,
-        vehicle.driver.power_speed_floor_mps,
+        wheel_speed_radps, speed_mps, problem.critical_slip, axle.wheel.radius_m, floor_mps
     )
     torque = 0.5 * power_w / conversion
     if torque > 0.0:
-        limit = torque_limit_nm(wheel_speed_radps, 0.0, vehicle.front.motor)
+        limit = torque_limit_nm(wheel_speed_radps, 0.0, axle.motor)
         if torque > limit:
             return limit, 0.0, 2.0 * (torque - limit) * conversion
         return torque, 0.0, 0.0
-    motor, friction = blend(torque, wheel_speed_radps, speed_mps, 0.0, 1.0, vehicle.front.motor)
-    return motor, max(friction, -vehicle.front.friction_brake.max_torque_nm), 0.0
+    motor, friction = blend(torque, wheel_speed_radps, speed_mps, 0.0, 1.0, axle.motor)
+    return motor, max(friction, -axle.friction_brake.max_torque_nm), 0.0
 
 
 @kernel
@@ -190,19 +186,27 @@ def _dynamic_step(
     vehicle: VehicleParams,
     problem: ProblemParams,
 ) -> Step:
-    motor = vehicle.front.motor
     battery = vehicle.battery
+    floor = vehicle.driver.power_speed_floor_mps
     dt = problem.dt_s
     gate_front, gate_rear = axles_gated(power_demand_w, slip_front, slip_rear, problem)
     power_front, power_rear = gated_split(power_demand_w, front_share, gate_front, gate_rear)
     front_speed = wheel_speed_of_state(slip_front, speed_mps, vehicle.front)
     rear_speed = wheel_speed_of_state(slip_rear, speed_mps, vehicle.rear)
 
-    front_motor, front_friction, front_short = _axle_torque(power_front, front_speed, speed_mps, vehicle, problem)
-    rear_motor, rear_friction, rear_short = _axle_torque(power_rear, rear_speed, speed_mps, vehicle, problem)
+    front_motor, front_friction, front_short = _axle_torque(
+        power_front, front_speed, speed_mps, vehicle.front, floor, problem
+    )
+    rear_motor, rear_friction, rear_short = _axle_torque(
+        power_rear, rear_speed, speed_mps, vehicle.rear, floor, problem
+    )
     shortfall = front_short + rear_short
-    scale = battery_scale(
-        front_motor, rear_motor, front_speed, rear_speed, battery.discharge_limit_w, battery.charge_limit_w, motor
+    scale = wheels_scale(
+        (front_motor, front_motor, rear_motor, rear_motor),
+        (front_speed, front_speed, rear_speed, rear_speed),
+        battery.discharge_limit_w,
+        battery.charge_limit_w,
+        vehicle,
     )
     if scale < 1.0:
         cut_front = (1.0 - scale) * front_motor
@@ -234,7 +238,12 @@ def _dynamic_step(
     front_mean = 0.5 * (front_speed + motion.wheel_speed_radps[0])
     rear_mean = 0.5 * (rear_speed + motion.wheel_speed_radps[2])
     speed_mean = 0.5 * (speed_mps + motion.speed_mps)
-    electrical = car_power_w(front_motor, rear_motor, front_mean, rear_mean, motor)
+    electrical = wheels_power_w(
+        (front_motor, front_motor, rear_motor, rear_motor),
+        (front_mean, front_mean, rear_mean, rear_mean),
+        1.0,
+        vehicle,
+    )
     if problem.power_error == POWER_ERROR_WHEEL:
         front_brake = max(motion.resisting_torque_nm[0] - drag_front, 0.0)
         rear_brake = max(motion.resisting_torque_nm[2] - drag_rear, 0.0)
