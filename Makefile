@@ -21,7 +21,7 @@ test: lint type  ## Linters, types and all tests (20 min)
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 ##@ Results
-.PHONY: policies study docs-numbers roads bench
+.PHONY: policies study unseen docs-numbers roads bench
 CYCLES := $(foreach cycle,ftp75 hwfet nycc,--cycle config/cycles/$(cycle).csv)
 policies: setup-run  ## Solve the shipped policies again, the same tables come out (2 min)
 	@for idle in drag none; do $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml --idle-drive $$idle \
@@ -29,6 +29,9 @@ policies: setup-run  ## Solve the shipped policies again, the same tables come o
 
 study: setup-run  ## All tables and figures of the paper, and what beats them (half an hour)
 	@$(BIN)/evaluate --study runs/study $(ARGS)
+
+unseen: setup-run  ## Our strategy on cycles and cars that were not there when it was made (hours; says how long)
+	@$(BIN)/evaluate --unseen runs/unseen $(ARGS)
 
 roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required
 	@$(BIN)/python -m iwm_sim.tools.roads --page docs/roads.md $(ARGS)

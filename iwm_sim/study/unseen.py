@@ -24,7 +24,7 @@ from iwm_power_manager.vehicle import Vehicle, load_vehicle
 from iwm_sim.study import generate
 from iwm_sim.study.frontier import COUNTS, Frontier, Place, margin, measure_frontier
 from iwm_sim.study.names import DEFAULT_GRID
-from iwm_sim.study.policies import TRAINING_CYCLES, solved
+from iwm_sim.study.policies import TRAINING_CYCLES, PolicySource
 
 #: Points of saving ours may be below a rival with no more changes, and the part of the cells in which it is to be so.
 CLOSE, PART = 0.005, 0.95
@@ -88,7 +88,7 @@ def place_of(cell: Cell) -> Place:
 def drive_cell(cell: Cell) -> Frontier:
     """The rivals, and ours at the default budget, on one cell."""
     place = place_of(cell)
-    policy = load_policy(solved(place.vehicle, cell.friction, DEFAULT_GRID))
+    policy = load_policy(PolicySource("policies", DEFAULT_GRID).find(place.vehicle, cell.friction))
     return measure_frontier(place, [(policy.problem.changes_per_min, policy.table())])
 
 

@@ -12,6 +12,7 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import read_yaml
 from iwm_power_manager.mdp.problem import load_problem, problem_from
 from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
 
 PAPER = share_path("config/grids/paper.yaml")
 FINE = share_path("config/grids/fine.yaml")
@@ -48,6 +49,23 @@ def test_the_price_of_a_change_may_depend_on_the_road():
     assert same.on_road(0.4) is same
     with pytest.raises(ConfigError, match="switching_cost_by_friction: stands beside switching_cost_j"):
         problem_from({**content, "switching_cost_j": 1}, "g.yaml")
+
+
+def test_axes_relative_to_the_car_grow_with_its_powers_and_speeds():
+    coupled = load_problem(share_path("config/grids/coupled.yaml"))
+    assert coupled.needs_car
+    car = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+    strong = car.with_axles(motor=car.front.motor._replace(max_power_w=30e3))
+    small, large = coupled.for_car(car), coupled.for_car(strong)
+    assert not small.needs_car and small.for_car(strong) is small
+    assert (small.power_w[0], small.power_w[-1]) == (-60e3, 30e3)
+    assert large.power_w == pytest.approx(4.0 * small.power_w, abs=0.5)
+    # Launching keeps its speeds; the top grows with what the road load lets through.
+    assert np.array_equal(small.speed_mps[:8], large.speed_mps[:8])
+    assert large.speed_mps[-1] > 1.3 * small.speed_mps[-1]
+    assert np.all(np.diff(small.speed_mps) > 0.0) and np.all(np.diff(large.speed_mps) > 0.0)
+    with pytest.raises(ConfigError, match="of_car"):
+        problem_from({**read_yaml(FINE), "power_w": {"of_car": [1, 0]}}, "g.yaml")
 
 
 def test_a_fixed_switching_cost_falls_due_with_any_change():

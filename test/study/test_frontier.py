@@ -1,0 +1,74 @@
+"""Frontiers: margins, bounds and verdicts from points, and one small drive."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from iwm_power_manager.cycle import make_cycle
+from iwm_power_manager.policy import load_policy
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+from iwm_sim.study import frontier, unseen
+from iwm_sim.study.frontier import COUNTS, Frontier, Place, Point
+
+CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), "drag")
+
+
+def point(saving, changes, fine=None, travel=None, held=True, strategy="instantaneous_slip"):
+    fine, travel = (changes if value is None else value for value in (fine, travel))
+    return Point(strategy, 0.0, saving, changes, fine, travel, 3, held)
+
+
+def test_a_margin_is_against_the_best_rival_with_no_more_changes():
+    rivals = [point(0.5, 10.0), point(0.4, 5.0), point(0.45, 5.0, fine=20.0), point(0.9, 5.0, held=False)]
+    assert frontier.margin(point(0.5, 6.0), rivals, "changes_per_min") == pytest.approx(0.05)
+    assert frontier.margin(point(0.5, 6.0), rivals, "fine_changes_per_min") == pytest.approx(0.1)
+    assert frontier.margin(point(-0.1, 0.0), rivals, "changes_per_min") == pytest.approx(-0.1)  # equal split is a rival
+    assert frontier.margin(point(0.5, 6.0, held=False), rivals, "changes_per_min") is None
+    assert frontier.margin(point(None, 6.0), rivals, "changes_per_min") is None
+
+
+def test_the_busiest_minute_counts_changes_by_more_than_a_quarter():
+    share = np.full(20_000, 0.5)
+    share[3000:] = 1.0
+    share[5000:] = 0.8
+    share[8900:] = 0.0
+    share[9100:] = 0.5
+    assert frontier.busiest_minute(share, 0.01) == 2
+    assert frontier.busiest_minute(np.full(100, 0.5), 0.01) == 0
+
+
+def test_a_verdict_needs_nearly_all_cells_close_none_far_below_and_the_mean_above():
+    good = [Frontier(str(k), (point(0.3, 5.0),), (point(0.35, 5.0),), ()) for k in range(19)]
+    near = Frontier("near", (point(0.3, 5.0),), (point(0.28, 5.0),), ())
+    far = Frontier("far", (point(0.3, 5.0),), (point(0.2, 5.0),), ())
+    assert all(verdict.reached for verdict in unseen.judge([*good, near]))
+    assert not any(verdict.reached for verdict in unseen.judge([*good, far]))
+    assert not any(verdict.reached for verdict in unseen.judge([*good, near, near]))
+    text = unseen.report([*good, far])
+    assert "NOT reached" in text and text.index("far") > text.index("worst cells")
+    assert {row["counted"] for row in json.loads(unseen.to_json([far]))["verdicts"]} == set(COUNTS)
+
+
+def test_cells_are_drawn_from_seeds_with_and_without_noise():
+    cells = unseen.cells("jalalmaab_2015", "drag", 1000, 2, 1)
+    assert len(cells) == 2 * (2 + 3) and len(set(cells)) == len(cells)
+    assert {cell.cycle for cell in cells} >= {1000, 1001}
+    assert sum(cell.noise_kmh is None for cell in cells) == 5
+    assert unseen.place_of(cells[1]).noise_seed == 1000
+    assert unseen.car_of(cells[-1]).name == "generated_1000"
+
+
+def test_the_bound_is_never_below_what_a_strategy_reached_with_no_more_changes():
+    speed = np.concatenate([np.linspace(0.0, 12.0, 10), np.full(12, 12.0), np.linspace(12.0, 0.0, 8), np.zeros(3)])
+    place = Place("short", CAR, make_cycle("short", np.arange(speed.size, dtype=float), speed), 0.9)
+    table = load_policy(share_path("policies/jalalmaab_2015_drag_coupled_mu090.npz")).table()
+    found = frontier.measure_frontier(place, [(8.0, table)], thresholds_w=(0.0, 60.0), bounds=True)
+    (ours,), (bound,) = found.ours, found.bounds
+    assert ours.held and bound.saving_percent >= ours.saving_percent > 0.0
+    within = [p for p in found.rivals if p.changes_per_min <= ours.changes_per_min]
+    assert all(bound.saving_percent >= p.saving_percent for p in within)
+    assert len(found.rivals) == 3
