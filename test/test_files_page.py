@@ -22,7 +22,7 @@ def size(value: int) -> str:
 @pytest.mark.parametrize(
     ("line", "value"),
     [
-        ("a file that is hashed", size(files.MAX_FILE_BYTES)),
+        ("a file that is read whole", size(files.MAX_FILE_BYTES)),
         ("CSV: cycles", size(files.MAX_TEXT_BYTES)),
         ("CSV: cycles", f"{files.MAX_LINE_LENGTH} characters a line"),
         ("CSV: cycles", f"{files.MAX_NUMBER_LENGTH} characters a number"),
