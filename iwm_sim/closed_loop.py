@@ -247,6 +247,7 @@ def measure(
         charge,
         soc,
         (1.0, 1.0, 1.0, 1.0),
+        1.0,
     )
 
 

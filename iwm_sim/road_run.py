@@ -81,6 +81,7 @@ def controller_of(scenario: Scenario, settings: Settings | None = None, policies
 def give(controller: Controller, sensors: Sensors, drive: Drive, now_ns: int) -> None:
     """Hand the power manager everything that arrives in this step."""
     monitor = controller.monitor
+    monitor.direction = float(sensors.direction)
     if not drive.lost("vehicle_speed") and not math.isnan(sensors.speed_mps):
         monitor.take_speed(SpeedReading(now_ns, sensors.speed_mps), now_ns)
     if not drive.lost("wheel_states"):

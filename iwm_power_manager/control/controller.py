@@ -32,7 +32,7 @@ from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.model.parameters import VehicleParams
 
 #: While a wheel is lost, slip is judged this much more strictly: its axle is watched through one wheel only.
-LOST_WHEEL_SLIP_FACTOR = 0.5
+LOST_WHEEL_SLIP_FACTOR = 0.75
 
 
 class ControlFaultError(RuntimeError):
@@ -156,7 +156,7 @@ class Controller:
         radius = self._vehicle.front.wheel.radius_m
         if supervision.stale & STALE_SPEED and not supervision.stale & STALE_WHEELS:
             # The wheel that slips least tells the speed best.
-            speed = max(radius * (max(wheels) if monitor.demand_w < 0.0 else min(wheels)), 0.0)
+            speed = radius * (max(wheels, key=abs) if monitor.demand_w < 0.0 else min(wheels, key=abs))
         elif supervision.stale & STALE_WHEELS and not supervision.stale & STALE_SPEED:
             wheels = (speed / radius,) * 4
         demand = shape_demand(monitor.demand_w, monitor.demand_speed_mps, speed, supervision)
@@ -172,6 +172,7 @@ class Controller:
             charge_limit_w=charge * factor,
             soc=monitor.soc,
             motor_gain=self.actuators.gains,
+            direction=monitor.direction,
         )
 
     def _settings(self) -> Settings:

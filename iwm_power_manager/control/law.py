@@ -2,6 +2,8 @@
 
 The order, which is also the order of precedence from weak to strong:
 
+0. motion: speed and direction, and which sensor is not believed (`control.motion`); all that follows is reckoned in the
+   direction of travel, so that brakes brake and slip is slip backwards too;
 1. slip of each wheel, filtered (eq. 10), and the torque the road took from it (eq. 11);
 2. split: the strategy decides the front share, many times a second; the applied share follows at a limited rate;
 3. skid gate: a wheel beyond the critical slip (Table 2 as printed: its axle) gets nothing, the others what they can;
@@ -11,6 +13,8 @@ The order, which is also the order of precedence from weak to strong:
 6. slew limits on the motors; while a regenerative torque grows, friction fills in, so that braking always gets through;
 7. battery limits on the motors (eq. 24, 43); friction takes over what cannot be regenerated.
 
+8. hold: where the car rolls against the direction asked for, friction holds it until the motors do.
+
 Steps 3 to 5 and 7 only ever make a motor torque smaller at once: no rate limit holds back a gate or a limit.
 Wheels come one by one, in the order front left, front right, rear left, rear right; each with the numbers of its axle.
 """
@@ -19,6 +23,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from iwm_power_manager.control.motion import Motion, estimate
 from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, GATE_MODE_TABLE2, Settings
 from iwm_power_manager.control.slew import slewed
 from iwm_power_manager.control.slip import UNLIMITED_NM, filtered, road_torque_nm, torque_room_nm, worse_slip
@@ -39,6 +44,7 @@ from iwm_power_manager.control.types import (
     WheelState,
 )
 from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.gate import axle_gated, gated_split
 from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
 from iwm_power_manager.model.motor import heat_after, regeneration_limit_nm, torque_limit_nm
@@ -51,6 +57,24 @@ ZERO_TORQUE_NM = 1e-6
 
 #: Part of the demand that sums and differences of powers may lose without a limit having bitten.
 ROUNDING = 1e-12
+
+
+#: Speed of a braked wheel as part of the car's that is still believed when power becomes torque.
+FASTEST_BRAKED = 1.12
+
+#: Torques that have been unequal for longer than this are no passing bump, s.
+UNEQUAL_S = 0.03
+
+#: Below this speed, m/s, the car counts as standing: it is what wheels and car must both exceed to be rolling.
+MOVING_MPS = 0.06
+#: The hold: slope it is made for; speed beyond which it is no longer a matter of holding, m/s; change of the torque of
+#: two motors that counts as none, N m a step; time in which it then fades, s.
+HOLD_GRADE = 0.25
+HOLD_BELOW_MPS = 1.5
+HOLD_STEADY_NM = 1.0
+HOLD_FADE_S = 0.4
+#: Drive torque fades over this much speed below the fastest reverse, m/s.
+REVERSE_FADE_MPS = 1.0
 
 
 class Wheel(NamedTuple):
@@ -111,6 +135,9 @@ def _wheel(
     speed_mps: float,
     demand_w: float,
     gain: float,
+    lower_part: float,
+    gate_mode: int,
+    slip_target: float,
     dt_s: float,
     first: bool,
     before: WheelState,
@@ -121,27 +148,32 @@ def _wheel(
     """Steps 1, 3 and 4 for one wheel; `gate_slip` is the slip its gate goes by."""
     braking = demand_w < 0.0
     radius = axle.wheel.radius_m
+    # A braked wheel is not faster than the car: one that seems to be must not weaken the brakes.
+    turning = min(wheel_speed_radps, FASTEST_BRAKED * speed_mps / radius) if braking else wheel_speed_radps
     conversion = conversion_speed_radps(
-        wheel_speed_radps, speed_mps, settings.critical_slip, radius, vehicle.driver.power_speed_floor_mps
+        turning, speed_mps, settings.critical_slip, radius, vehicle.driver.power_speed_floor_mps
     )
+    if braking:
+        conversion *= lower_part
     fast = max(wheel_speed_radps, conversion)
     road = 0.0
     if not first:
         taken = road_torque_nm(before.total_nm, before.speed_radps, wheel_speed_radps, dt_s, axle.wheel.inertia_kgm2)
         road = filtered(before.road_nm, taken, dt_s, settings.slip_filter_s)
     gated = False
-    if settings.gate_mode != GATE_MODE_OFF:
+    # The brakes have to be able to hold a car at rest: what is slip there, sensors cannot tell.
+    if gate_mode != GATE_MODE_OFF and not (braking and speed_mps < settings.slip_speed_floor_mps):
         gated = axle_gated(
             gate_slip, demand_w, before.gated, settings.critical_slip, settings.gate_hysteresis, settings.gate_driving
         )
     grip = UNLIMITED_NM
-    if settings.gate_mode == GATE_MODE_LIMITER:
+    if gate_mode == GATE_MODE_LIMITER:
         grip = torque_room_nm(
             braking,
             road,
             wheel_speed_radps,
             speed_mps,
-            settings.slip_target,
+            slip_target,
             settings.slip_limiter_s,
             settings.slip_speed_floor_mps,
             radius,
@@ -168,21 +200,23 @@ def _room_nm(wheel: Wheel) -> float:
 
 
 @kernel
-def _rooms_nm(
-    left: Wheel, right: Wheel, unequal_s: float, dt_s: float, budget_nm: float, growth_nmps: float, axle: Axle
-) -> tuple[float, float, float]:
-    """Room of an axle's two wheels within its yaw budget, and how long they have been unequal by then.
+def _rooms_nm(left: Wheel, right: Wheel, moment_nm: float, axle: Axle) -> tuple[float, float]:
+    """Room of an axle's two wheels within its yaw budget.
 
     The moment of a difference of torques T is T / radius * track / 2.
     """
     left_room = _room_nm(left)
     right_room = _room_nm(right)
-    if left_room == right_room:
-        return left_room, right_room, max(unequal_s - dt_s, 0.0)
-    moment = budget_nm + growth_nmps * unequal_s
-    difference = moment * 2.0 * axle.wheel.radius_m / axle.track_width_m
-    less = min(left_room, right_room)
-    return min(left_room, less + difference), min(right_room, less + difference), unequal_s + dt_s
+    difference = moment_nm * 2.0 * axle.wheel.radius_m / axle.track_width_m
+    most = min(left_room, right_room) + difference
+    return min(left_room, most), min(right_room, most)
+
+
+@kernel
+def _unequal_s(before_s: float, left: Wheel, right: Wheel, unequal: bool, short: bool, dt_s: float) -> float:
+    """How long an axle's torques have been unequal, or would have been without a yaw budget."""
+    wanted = unequal or (short and _room_nm(left) != _room_nm(right))
+    return before_s + dt_s if wanted else max(before_s - dt_s, 0.0)
 
 
 @kernel
@@ -278,23 +312,23 @@ def _after(
 
 
 @kernel
-def step(
+def drive(
     measurement: Measurement,
     state: ControllerState,
+    slip_control: bool,
+    lower_part: float,
     settings: Settings,
     vehicle: VehicleParams,
     policy: PolicyTable,
 ) -> tuple[Command, ControllerState]:
-    """One control step.
+    """Steps 1 to 7, all in the direction of travel.
 
     Parameters
     ----------
-    measurement : checked inputs; every number finite, speeds >= 0
-    state : what the previous step returned, or `initial_state()`
-
-    Returns
-    -------
-    Command, ControllerState
+    measurement : speeds that are believed
+    state : of the step before
+    slip_control : gate and slip limiter may act
+    lower_part : a power that brakes is divided by this part of the speed (`motion.Motion`)
     """
     front, rear = vehicle.front, vehicle.rear
     fl0, fr0, rl0, rr0 = state.wheels
@@ -319,21 +353,38 @@ def step(
     memory = split(measurement, speed, front_slip, rear_slip, first, state.split, settings, vehicle, policy)
 
     # 3. gate, 4. capacity
-    printed = settings.gate_mode == GATE_MODE_TABLE2
+    gate_mode = settings.gate_mode if slip_control else GATE_MODE_OFF
+    printed = gate_mode == GATE_MODE_TABLE2
+    # Unequal torques have to be steered against: the tyres must keep something to steer with.
+    unequal = braking and max(state.front_unequal_s, state.rear_unequal_s) > UNEQUAL_S
+    target = min(settings.slip_target, settings.unequal_slip_target) if unequal else settings.slip_target
     fl_gate, fr_gate = (front_slip, front_slip) if printed else (fl_slip, fr_slip)
     rl_gate, rr_gate = (rear_slip, rear_slip) if printed else (rl_slip, rr_slip)
-    fl = _wheel(w[0], fl_slip, fl_gate, speed, demand, gain[0], dt, first, fl0, front, settings, vehicle)
-    fr = _wheel(w[1], fr_slip, fr_gate, speed, demand, gain[1], dt, first, fr0, front, settings, vehicle)
-    rl = _wheel(w[2], rl_slip, rl_gate, speed, demand, gain[2], dt, first, rl0, rear, settings, vehicle)
-    rr = _wheel(w[3], rr_slip, rr_gate, speed, demand, gain[3], dt, first, rr0, rear, settings, vehicle)
+    fl = _wheel(
+        w[0], fl_slip, fl_gate, speed, demand, gain[0], lower_part, gate_mode, target, dt, first, fl0, front,
+        settings, vehicle,
+    )  # fmt: skip
+    fr = _wheel(
+        w[1], fr_slip, fr_gate, speed, demand, gain[1], lower_part, gate_mode, target, dt, first, fr0, front,
+        settings, vehicle,
+    )  # fmt: skip
+    rl = _wheel(
+        w[2], rl_slip, rl_gate, speed, demand, gain[2], lower_part, gate_mode, target, dt, first, rl0, rear,
+        settings, vehicle,
+    )  # fmt: skip
+    rr = _wheel(
+        w[3], rr_slip, rr_gate, speed, demand, gain[3], lower_part, gate_mode, target, dt, first, rr0, rear,
+        settings, vehicle,
+    )  # fmt: skip
     front_gated = fl.gated and fr.gated
     rear_gated = rl.gated and rr.gated
-    fl_room, fr_room, front_unequal = _rooms_nm(
-        fl, fr, state.front_unequal_s, dt, settings.front_yaw_nm, settings.front_yaw_growth_nmps, front
-    )
-    rl_room, rr_room, rear_unequal = _rooms_nm(
-        rl, rr, state.rear_unequal_s, dt, settings.rear_yaw_nm, settings.rear_yaw_growth_nmps, rear
-    )
+    front_moment = settings.front_yaw_nm + settings.front_yaw_growth_nmps * state.front_unequal_s
+    rear_moment = settings.rear_yaw_nm + settings.rear_yaw_growth_nmps * state.rear_unequal_s
+    # Motors pull far less than brakes, and most at low speed: driving, all of it is there at once.
+    front_moment = min(front_moment, settings.front_yaw_most_nm) if braking else settings.front_yaw_most_nm
+    rear_moment = min(rear_moment, settings.rear_yaw_most_nm) if braking else settings.rear_yaw_most_nm
+    fl_room, fr_room = _rooms_nm(fl, fr, front_moment, front)
+    rl_room, rr_room = _rooms_nm(rl, rr, rear_moment, rear)
     front_power, rear_power = gated_split(demand, memory.applied_share, front_gated, rear_gated)
     front_asked = abs(front_power)
     rear_asked = abs(rear_power)
@@ -393,6 +444,9 @@ def step(
         front_slip=front_slip,
         rear_slip=rear_slip,
         gated_wheels=(1 if fl.gated else 0) + (2 if fr.gated else 0) + (4 if rl.gated else 0) + (8 if rr.gated else 0),
+        speed_mps=measurement.speed_mps,
+        doubted=0,
+        hold_nm=0.0,
     )
     after = ControllerState(
         steps=state.steps + 1,
@@ -403,7 +457,168 @@ def step(
             _after(rl, motor[2], friction[2], rl0, dt, rear),
             _after(rr, motor[3], friction[3], rr0, dt, rear),
         ),
-        front_unequal_s=front_unequal,
-        rear_unequal_s=rear_unequal,
+        front_unequal_s=_unequal_s(state.front_unequal_s, fl, fr, fl_nm != fr_nm, front_short, dt),
+        rear_unequal_s=_unequal_s(state.rear_unequal_s, rl, rr, rl_nm != rr_nm, rear_short, dt),
+        motion=state.motion,
+        travel=state.travel,
+        hold_nm=state.hold_nm,
     )
     return command, after
+
+
+@kernel
+def _turned(wheel: WheelState) -> WheelState:
+    """What is remembered of a wheel, reckoned in the other direction of travel."""
+    return WheelState(
+        motor_nm=-wheel.motor_nm,
+        total_nm=-wheel.motor_nm + (wheel.total_nm - wheel.motor_nm),
+        speed_radps=-wheel.speed_radps,
+        road_nm=-wheel.road_nm,
+        slip=0.0,
+        gated=False,
+        heat=wheel.heat,
+    )
+
+
+@kernel
+def _travel(speed_mps: float, demand_w: float, direction: float, before: float) -> float:
+    """Direction everything is reckoned in: driving, the one asked for; braking, the one the car moves in."""
+    if demand_w >= 0.0:
+        return direction
+    if abs(speed_mps) < MOVING_MPS:
+        return before
+    return 1.0 if speed_mps > 0.0 else -1.0
+
+
+@kernel
+def _hold_nm(
+    before_nm: float,
+    motion: Motion,
+    measurement: Measurement,
+    motor_nm: float,
+    motor_before_nm: float,
+    vehicle: VehicleParams,
+) -> float:
+    """Friction torque a wheel is held with on a slope, N m >= 0.
+
+    It comes when the car begins to roll against the direction asked for, and goes when the car moves off; while the
+    driver drives and the motors have come to what he asks for, it fades.
+    """
+    chassis = vehicle.chassis
+    w = motion.wheel_speed_radps
+    rolling = measurement.direction * motion.speed_mps
+    wheels = measurement.direction * 0.25 * (w[0] + w[1] + w[2] + w[3]) * vehicle.front.wheel.radius_m
+    most = 0.25 * chassis.mass_kg * GRAVITY_MPS2 * HOLD_GRADE * vehicle.front.wheel.radius_m
+    if rolling > MOVING_MPS or wheels > MOVING_MPS:
+        return 0.0
+    if (
+        rolling < -MOVING_MPS
+        and wheels < -MOVING_MPS
+        and rolling > -HOLD_BELOW_MPS
+        and measurement.power_demand_w >= 0.0
+    ):
+        return most
+    if measurement.power_demand_w > 0.0 and abs(motor_nm - motor_before_nm) < HOLD_STEADY_NM:
+        return max(before_nm - most * measurement.dt_s / HOLD_FADE_S, 0.0)
+    return before_nm
+
+
+@kernel
+def _held(friction_nm: float, hold_nm: float, gated: bool, axle: Axle) -> float:
+    """Friction torque with what the hold adds."""
+    return friction_nm if gated else max(min(friction_nm, -hold_nm), -axle.friction_brake.max_torque_nm)
+
+
+@kernel
+def step(
+    measurement: Measurement,
+    state: ControllerState,
+    settings: Settings,
+    vehicle: VehicleParams,
+    policy: PolicyTable,
+) -> tuple[Command, ControllerState]:
+    """One control step.
+
+    Parameters
+    ----------
+    measurement : checked inputs; every number finite, but for a vehicle speed that is not known
+    state : what the previous step returned, or `initial_state()`
+
+    Returns
+    -------
+    Command, ControllerState
+    """
+    m = measurement
+    motion, motion_after = estimate(m, state.motion, state.wheels, state.travel, state.steps == 0, vehicle)
+    travel = _travel(motion.speed_mps, m.power_demand_w, m.direction, state.travel)
+    a, b, c, d = state.wheels
+    if travel != state.travel:
+        a, b, c, d = _turned(a), _turned(b), _turned(c), _turned(d)
+    before = ControllerState(
+        steps=state.steps,
+        split=state.split,
+        wheels=(a, b, c, d),
+        front_unequal_s=state.front_unequal_s,
+        rear_unequal_s=state.rear_unequal_s,
+        motion=motion_after,
+        travel=travel,
+        hold_nm=state.hold_nm,
+    )
+    demand = m.power_demand_w
+    if demand > 0.0 and m.direction < 0.0:
+        over = (settings.reverse_speed_mps + motion.speed_mps) / REVERSE_FADE_MPS
+        demand *= min(max(over, 0.0), 1.0)
+    w = motion.wheel_speed_radps
+    believed = Measurement(
+        travel * motion.speed_mps,
+        (travel * w[0], travel * w[1], travel * w[2], travel * w[3]),
+        demand,
+        m.dt_s,
+        m.friction,
+        m.discharge_limit_w,
+        m.charge_limit_w,
+        m.soc,
+        m.motor_gain,
+        m.direction,
+    )
+    # A car that rolls back is to be stopped, whatever its wheels do.
+    slip_control = travel == m.direction or demand >= 0.0
+    made, after = drive(believed, before, slip_control, motion.lower_part, settings, vehicle, policy)
+    e, f, g, h = after.wheels
+    motor = made.motor_torque_nm
+    friction = made.friction_torque_nm
+    hold = _hold_nm(state.hold_nm, motion, m, motor[0] + motor[2], a.motor_nm + c.motor_nm, vehicle)
+    if hold > 0.0 and demand >= 0.0:
+        friction = (
+            _held(friction[0], hold, e.gated, vehicle.front),
+            _held(friction[1], hold, f.gated, vehicle.front),
+            _held(friction[2], hold, g.gated, vehicle.rear),
+            _held(friction[3], hold, h.gated, vehicle.rear),
+        )
+    command = Command(
+        motor_torque_nm=(travel * motor[0], travel * motor[1], travel * motor[2], travel * motor[3]),
+        friction_torque_nm=friction,
+        front_share=made.front_share,
+        decided_share=made.decided_share,
+        gate=made.gate,
+        limits=made.limits,
+        front_power_w=made.front_power_w,
+        rear_power_w=made.rear_power_w,
+        front_slip=made.front_slip,
+        rear_slip=made.rear_slip,
+        gated_wheels=made.gated_wheels,
+        speed_mps=motion.speed_mps,
+        doubted=motion.doubted,
+        hold_nm=hold,
+    )
+    final = ControllerState(
+        steps=after.steps,
+        split=after.split,
+        wheels=after.wheels,
+        front_unequal_s=after.front_unequal_s,
+        rear_unequal_s=after.rear_unequal_s,
+        motion=motion_after,
+        travel=travel,
+        hold_nm=hold,
+    )
+    return command, final

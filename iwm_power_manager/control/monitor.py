@@ -141,6 +141,7 @@ class InputMonitor:
     ----------
     speed_mps, wheel_speed_radps, demand_w, soc, temperature_c, friction : last accepted values
     demand_speed_mps : speed of the car when the last demand was accepted
+    direction : the driver asks for, 1 forwards, -1 reverse
     verdicts : what was wrong with each wheel in the last `wheel_states`
     motor_torque_nm : torques the motors reported since `collect_torques` was called last, NaN for each that did not
     tallies : counters by topic
@@ -157,6 +158,7 @@ class InputMonitor:
         self.speed_mps = 0.0
         self.wheel_speed_radps: Wheels = (0.0, 0.0, 0.0, 0.0)
         self.demand_w = 0.0
+        self.direction = 1.0
         self.demand_speed_mps = 0.0
         self.soc = 0.5
         self.temperature_c = math.nan
@@ -195,8 +197,7 @@ class InputMonitor:
             last = math.nan if tally.accepted_ns is None else self.speed_mps
             violation = check_value(reading.speed_mps, last, tally.age_s(reading.stamp_ns), self._limits.speed)
         if tally.note(violation, reading.stamp_ns):
-            # Noise around standstill is not driving backwards.
-            self.speed_mps = max(reading.speed_mps, 0.0)
+            self.speed_mps = reading.speed_mps
             return True
         return False
 

@@ -36,6 +36,7 @@ _MEASUREMENT = (
     Signal("charge_limit_w", "electrical power the battery may take"),
     Signal("soc", "state of charge, 0..1"),
     *(Signal(f"{wheel}_motor_gain", "part of a commanded torque the motor delivers, 0..1") for wheel in WHEEL_NAMES),
+    Signal("direction", "direction the driver asks for: 1 forwards, -1 reverse"),
 )
 _COMMAND = (
     *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in WHEEL_NAMES),
@@ -53,6 +54,9 @@ _COMMAND = (
     Signal("front_slip", "filtered slip of the front axle"),
     Signal("rear_slip", "filtered slip of the rear axle"),
     Signal("gated_wheels", "bits of the wheels held at zero torque: 1, 2, 4, 8 in the order of the wheels"),
+    Signal("estimated_speed_mps", "speed of the car as estimated, negative backwards"),
+    Signal("doubted", "bits of the sensors that are not believed: 1, 2, 4, 8 the wheels, 16 vehicle_speed"),
+    Signal("hold_nm", "friction torque of each wheel that holds the car on a slope"),
 )
 _CONTROLLER = (
     Signal("step", "steps since the law's initial state; 0 is the first"),
@@ -107,8 +111,9 @@ def to_numbers(
     return [
         measurement.speed_mps,
         *measurement.wheel_speed_radps,
-        *measurement[2:-1],
+        *measurement[2:8],
         *measurement.motor_gain,
+        measurement.direction,
         *decided(command, before, after),
         *supervision[:4],
         watch.wheels_lost,
@@ -119,7 +124,9 @@ def to_numbers(
 
 
 #: What a record that is older than a signal would have said.
-YOUNGER_SIGNALS = {"gated_wheels": 0.0} | {f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES}
+YOUNGER_SIGNALS = {"gated_wheels": 0.0, "doubted": 0.0, "hold_nm": 0.0, "direction": 1.0} | {
+    f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES
+}
 
 #: The signals the law decides.
 DECIDED_NAMES = tuple(signal.name for signal in (*_COMMAND, *_CONTROLLER))
@@ -154,21 +161,23 @@ def from_numbers(values: Mapping[str, float]) -> RecordedStep:
     KeyError
         A signal is missing: the record was not made by this project, or by another version of it.
     """
+    known = YOUNGER_SIGNALS | dict(values)
 
     def wheels(signal: str) -> Wheels:
-        fl, fr, rl, rr = (float(values[f"{wheel}_{signal}"]) for wheel in WHEEL_NAMES)
+        fl, fr, rl, rr = (float(known[f"{wheel}_{signal}"]) for wheel in WHEEL_NAMES)
         return (fl, fr, rl, rr)
 
     measurement = Measurement(
-        speed_mps=float(values["speed_mps"]),
+        speed_mps=float(known["speed_mps"]),
         wheel_speed_radps=wheels("speed_radps"),
-        power_demand_w=float(values["power_demand_w"]),
-        dt_s=float(values["dt_s"]),
-        friction=float(values["friction"]),
-        discharge_limit_w=float(values["discharge_limit_w"]),
-        charge_limit_w=float(values["charge_limit_w"]),
-        soc=float(values["soc"]),
+        power_demand_w=float(known["power_demand_w"]),
+        dt_s=float(known["dt_s"]),
+        friction=float(known["friction"]),
+        discharge_limit_w=float(known["discharge_limit_w"]),
+        charge_limit_w=float(known["charge_limit_w"]),
+        soc=float(known["soc"]),
         motor_gain=wheels("motor_gain"),
+        direction=float(known["direction"]),
     )
     # Integers and flags travel as numbers; the law has to get back the types it was compiled for.
     # A setting that is younger than the record has its default.

@@ -92,6 +92,10 @@ class Settings(NamedTuple):
     gate_driving: Annotated[bool, Setting("also gate driving slip")] = True
     # 99.8 % of the peak friction of the paper's tyre, and a margin to the critical slip.
     slip_target: Annotated[float, Setting("slip the limiter holds, below critical_slip", "", 0.01, 0.9)] = 0.16
+    # Two thirds of the peak friction, and as much to steer with.
+    unequal_slip_target: Annotated[
+        float, Setting("slip the limiter holds while left and right are at unequal torques", "", 0.01, 0.9)
+    ] = 0.06
     # Stops within 5 % of the shortest way at every friction; faster shakes the car more.
     slip_limiter_s: Annotated[float, Setting("time constant of the slip limiter", "s", 0.001, 1.0)] = 0.025
     slip_filter_s: Annotated[
@@ -103,10 +107,9 @@ class Settings(NamedTuple):
     # the rate at which he can steer against it.
     front_yaw_nm: Annotated[
         float, Setting("yaw moment that unequal torques of the front wheels may have at once", "N m", 0.0, 1e5)
-    ] = 600.0
-    front_yaw_growth_nmps: Annotated[float, Setting("growth of it while it is used; 0 is none", "N m/s", 0.0, 1e6)] = (
-        2000.0
-    )
+    ] = 50.0
+    front_yaw_growth_nmps: Annotated[float, Setting("growth of it while it is used", "N m/s", 0.0, 1e6)] = 150.0
+    front_yaw_most_nm: Annotated[float, Setting("what it grows to", "N m", 0.0, 1e5)] = 600.0
     # The rear wheels keep the car straight: both get what the one with less grip can take (select-low).
     rear_yaw_nm: Annotated[
         float,
@@ -114,7 +117,9 @@ class Settings(NamedTuple):
             "yaw moment that unequal torques of the rear wheels may have at once; 0 is select-low", "N m", 0.0, 1e5
         ),
     ] = 0.0
-    rear_yaw_growth_nmps: Annotated[float, Setting("growth of it while it is used; 0 is none", "N m/s", 0.0, 1e6)] = 0.0
+    rear_yaw_growth_nmps: Annotated[float, Setting("growth of it while it is used", "N m/s", 0.0, 1e6)] = 0.0
+    rear_yaw_most_nm: Annotated[float, Setting("what it grows to", "N m", 0.0, 1e5)] = 0.0
+    reverse_speed_mps: Annotated[float, Setting("fastest reverse the motors drive to", "m/s", 0.5, 20.0)] = 5.0
     # From rest to the peak torque in 0.125 s; from there to zero in one step of 10 ms (gates and limits may be faster);
     # to full regeneration in 0.02 s.
     slew_up_nmps: Annotated[float, Setting("fastest growth of a driving motor torque", "N m/s", 10.0, 1e6)] = 1600.0

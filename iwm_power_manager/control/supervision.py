@@ -125,4 +125,5 @@ def shape_demand(demand_w: float, demand_speed_mps: float, speed_mps: float, sta
         return demand_w
     held = demand_w * state.brake_factor
     # Hold the force, not the power: P = F v.
-    return held * speed_mps / demand_speed_mps if speed_mps < demand_speed_mps else held
+    speed, then = abs(speed_mps), abs(demand_speed_mps)
+    return held * speed / then if speed < then else held

@@ -40,8 +40,8 @@ class Thresholds(NamedTuple):
     speed_noise_mps: Annotated[
         float, _threshold("change of vehicle speed that is always believed", "m/s", 0.0, 5.0)
     ] = 0.6
-    # A sensor may read a little backwards at rest; a car that rolls faster than this is not measured by it.
-    speed_min_mps: Annotated[float, _threshold("smallest believed vehicle speed", "m/s", -150.0, 0.0)] = -1.0
+    # A car that rolls back unbraked; faster it does not drive backwards.
+    speed_min_mps: Annotated[float, _threshold("smallest believed vehicle speed", "m/s", -150.0, 0.0)] = -30.0
     wheel_speed_max_radps: Annotated[
         float, _threshold("largest believed wheel speed, either way", "rad/s", 1.0, 2000.0)
     ] = 300.0

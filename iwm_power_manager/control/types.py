@@ -46,8 +46,8 @@ class Measurement(NamedTuple):
 
     Attributes
     ----------
-    speed_mps : vehicle speed over ground, >= 0
-    wheel_speed_radps : four wheel speeds, rad/s
+    speed_mps : vehicle speed over ground as its sensor shows it, negative backwards (NaN: not known)
+    wheel_speed_radps : four wheel speeds, rad/s, negative backwards
     power_demand_w : power the driver asks for at the wheels, braking negative
     dt_s : time since the previous step, > 0
     friction : peak friction coefficient of the road the strategy is to assume
@@ -55,6 +55,7 @@ class Measurement(NamedTuple):
     charge_limit_w : electrical power the battery may take, >= 0
     soc : state of charge, 0..1
     motor_gain : part of a commanded torque that each motor delivers, 0..1; 0 switches it off
+    direction : the driver asks for, 1 forwards, -1 reverse
     """
 
     speed_mps: float
@@ -66,6 +67,7 @@ class Measurement(NamedTuple):
     charge_limit_w: float
     soc: float
     motor_gain: Wheels = (1.0, 1.0, 1.0, 1.0)
+    direction: float = 1.0
 
 
 class Command(NamedTuple):
@@ -82,6 +84,9 @@ class Command(NamedTuple):
     front_power_w, rear_power_w : sum over the axle's wheels of (motor + friction torque) * conversion speed
     front_slip, rear_slip : filtered slip of the axle's worse wheel
     gated_wheels : bits 1, 2, 4, 8 of the wheels held at zero torque, in the order of the wheels
+    speed_mps : speed of the car as estimated, negative backwards
+    doubted : bits of the sensors that are not believed: 1, 2, 4, 8 the wheels, 16 the vehicle speed
+    hold_nm : friction torque of each wheel that keeps the car from rolling against the direction asked for, >= 0
     """
 
     motor_torque_nm: Wheels
@@ -95,10 +100,13 @@ class Command(NamedTuple):
     front_slip: float
     rear_slip: float
     gated_wheels: int
+    speed_mps: float
+    doubted: int
+    hold_nm: float
 
 
 class WheelState(NamedTuple):
-    """What the law remembers of one wheel.
+    """What the law remembers of one wheel; torques and speeds in the direction of travel.
 
     Attributes
     ----------
@@ -140,6 +148,31 @@ class SplitMemory(NamedTuple):
     jitter: Jitter
 
 
+class MotionState(NamedTuple):
+    """What `control.motion` remembers from step to step.
+
+    Attributes
+    ----------
+    speed_mps : the reference, negative backwards
+    bias_mps2 : acceleration the forces do not explain: slope, load
+    shown_mps, shown_s, moved_mps : the sensor's last number, for how long it has shown it, what the reference did since
+    apart_s : how long the speed sensor has contradicted wheels that roll freely
+    doubt_s : time the speed sensor has yet to be good; 0 is believed
+    wheel_stray_s : how long each wheel has stayed away although nothing holds it
+    wheel_doubt_s : time each wheel has yet to be good
+    """
+
+    speed_mps: float
+    bias_mps2: float
+    shown_mps: float
+    shown_s: float
+    moved_mps: float
+    apart_s: float
+    doubt_s: float
+    wheel_stray_s: Wheels
+    wheel_doubt_s: Wheels
+
+
 class ControllerState(NamedTuple):
     """What the law remembers from one step to the next; `initial_state` makes the first one.
 
@@ -150,6 +183,9 @@ class ControllerState(NamedTuple):
     wheels : of each wheel
     front_unequal_s, rear_unequal_s : how long the wheels of the axle have been kept at unequal torques; it lets their
         yaw budget grow
+    motion : of the estimate of speed and direction
+    travel : direction of travel the torques and speeds of `wheels` are reckoned in: 1 forwards, -1 backwards
+    hold_nm : friction torque of each wheel that holds the car on a slope
     """
 
     steps: int
@@ -157,14 +193,35 @@ class ControllerState(NamedTuple):
     wheels: tuple[WheelState, WheelState, WheelState, WheelState]
     front_unequal_s: float
     rear_unequal_s: float
+    motion: MotionState
+    travel: float
+    hold_nm: float
 
 
 def initial_state() -> ControllerState:
-    """The law's memory before its first step: at rest, cold, power split equally."""
+    """The law's memory before its first step: at rest, cold, power split equally, all sensors believed."""
     wheel = WheelState(motor_nm=0.0, total_nm=0.0, speed_radps=0.0, road_nm=0.0, slip=0.0, gated=False, heat=0.0)
+    none = (0.0, 0.0, 0.0, 0.0)
     split = SplitMemory(
         decisions=0, age_s=0.0, decided_share=0.5, applied_share=0.5, changes_used=0.0, jitter=no_jitter()
     )
     return ControllerState(
-        steps=0, split=split, wheels=(wheel, wheel, wheel, wheel), front_unequal_s=0.0, rear_unequal_s=0.0
+        steps=0,
+        split=split,
+        wheels=(wheel, wheel, wheel, wheel),
+        front_unequal_s=0.0,
+        rear_unequal_s=0.0,
+        motion=MotionState(
+            speed_mps=0.0,
+            bias_mps2=0.0,
+            shown_mps=0.0,
+            shown_s=0.0,
+            moved_mps=0.0,
+            apart_s=0.0,
+            doubt_s=0.0,
+            wheel_stray_s=none,
+            wheel_doubt_s=none,
+        ),
+        travel=1.0,
+        hold_nm=0.0,
     )

@@ -53,6 +53,7 @@ from iwm_power_manager.signals.contract import JOINT_STATE, NODE_STATE
 from iwm_power_manager.signals.mapping import DEMANDS, PEDALS
 from iwm_power_manager.signals.readings import (
     DemandReading,
+    DirectionReading,
     FrictionReading,
     TopicReader,
     TorqueReading,
@@ -401,6 +402,8 @@ class PowerManager(KeepsItsValues, LifecycleNode):
             monitor.take_friction(reading.friction, now_ns)
         elif kind is TorqueReading:
             monitor.take_torques(reading)
+        elif kind is DirectionReading:
+            monitor.direction = reading.direction
 
     def _on_demand(self, data: bytes, info: dict[str, Any]) -> None:
         """Lock-step: the demand closes a set."""

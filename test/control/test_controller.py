@@ -249,7 +249,7 @@ class TestStandIns:
         values = drive.run(10, wheels=self.WHEELS, demand=demand, without=("speed",))
         assert values["speed_mps"] == RADIUS * wheel
 
-    @pytest.mark.parametrize(("wheel", "speed"), [(0.5, 0.5 * RADIUS), (-0.5, 0.0)])
+    @pytest.mark.parametrize(("wheel", "speed"), [(0.5, 0.5 * RADIUS), (-0.5, -0.5 * RADIUS)])
     def test_a_car_that_stands_or_rolls_back_a_little_is_seen_as_it_is(self, drive, wheel, speed) -> None:
         drive.run(60, speed=0.0)
         assert drive.run(10, wheels=(wheel,) * 4, without=("speed",))["speed_mps"] == speed
@@ -261,9 +261,9 @@ class TestLostWheel:
         values = drive.run(2, wheels=(math.nan, 30.0, 30.5, 30.5))
         assert values["wheels_lost"] == 1
         assert values["front_left_speed_radps"] == 30.0
-        assert values["setting.critical_slip"] == default_settings("equal").critical_slip / 2
-        assert values["setting.slip_target"] == default_settings("equal").slip_target / 2
-        assert values["setting.gate_hysteresis"] == default_settings("equal").gate_hysteresis / 2
+        assert values["setting.critical_slip"] == default_settings("equal").critical_slip * 0.75
+        assert values["setting.slip_target"] == default_settings("equal").slip_target * 0.75
+        assert values["setting.gate_hysteresis"] == default_settings("equal").gate_hysteresis * 0.75
         assert values["mode"] == MODE_NORMAL
         assert min(motor(values)) > 0.0
         values = drive.run(100)

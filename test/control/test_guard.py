@@ -40,6 +40,9 @@ def command(motor=(0.0,) * 4, friction=(0.0,) * 4, gated_wheels=0, gate=None) ->
         front_slip=0.0,
         rear_slip=0.0,
         gated_wheels=gated_wheels,
+        speed_mps=0.0,
+        doubted=0,
+        hold_nm=0.0,
     )
 
 

@@ -92,9 +92,15 @@ class Case(NamedTuple):
         ]  # fmt: skip
 
     def conversion(self, i):
-        radius = self.axle(i).wheel.radius_m
+        radius, wheel = self.axle(i).wheel.radius_m, self.m.wheel_speed_radps[i]
+        if self.braking:
+            wheel = min(wheel, 1.12 * self.m.speed_mps / radius)
         held = self.m.speed_mps * (1.0 - self.settings.critical_slip) / radius
-        return max(self.m.wheel_speed_radps[i], held, self.car.driver.power_speed_floor_mps / radius)
+        return max(wheel, held, self.car.driver.power_speed_floor_mps / radius)
+
+    @property
+    def slip_target(self):
+        return oracle.slip_target(self.before, self.settings, self.braking)
 
     def fast(self, i):
         return max(self.m.wheel_speed_radps[i], self.conversion(i))
@@ -109,7 +115,8 @@ class Case(NamedTuple):
             return math.inf
         wheel = self.m.wheel_speed_radps[i]
         road = self.after.wheels[i].road_nm
-        return oracle.grip(self.braking, road, wheel, self.m.speed_mps, self.settings, self.axle(i))
+        tuned = self.settings._replace(slip_target=self.slip_target)
+        return oracle.grip(self.braking, road, wheel, self.m.speed_mps, tuned, self.axle(i))
 
     def battery_w(self, factor=1.0):
         return sum(
@@ -118,9 +125,14 @@ class Case(NamedTuple):
         )
 
 
+def drive(m, before, s, car, table):
+    """The law in the direction of travel, all sensors believed."""
+    return law.drive(m, before, True, 1.0, s, car, table)
+
+
 def take(m, before=None, s=DEFAULT, car=CAR):
     before = initial_state() if before is None else before
-    return Case(m, before, s, car, *law.step(m, before, s, car, TABLE))
+    return Case(m, before, s, car, *drive(m, before, s, car, TABLE))
 
 
 def measurement(speed=15.0, slips=(0.0, 0.0), demand=5000.0, dt=0.01, discharge=NO_LIMIT, charge=NO_LIMIT, **changes):
@@ -184,6 +196,9 @@ TUNINGS = st.builds(
     front_yaw_growth_nmps=st.sampled_from((0.0, 2000.0)),
     rear_yaw_nm=st.sampled_from((0.0, 300.0)),
     rear_yaw_growth_nmps=st.sampled_from((0.0, 500.0)),
+    front_yaw_most_nm=st.sampled_from((500.0, 1e5)),
+    rear_yaw_most_nm=st.sampled_from((0.0, 400.0)),
+    unequal_slip_target=st.sampled_from((0.06, 0.3)),
     slew_up_nmps=st.sampled_from((1600.0, 300.0)),
     slew_down_nmps=st.sampled_from((20000.0, 900.0)),
     slew_regeneration_nmps=st.sampled_from((4000.0, 500.0)),
@@ -220,6 +235,9 @@ MEMORIES = st.builds(
     wheels=FOUR_STATES,
     front_unequal_s=AGES,
     rear_unequal_s=AGES,
+    motion=st.just(initial_state().motion),
+    travel=st.just(1.0),
+    hold_nm=st.just(0.0),
 )
 
 
@@ -272,8 +290,8 @@ def the_yaw_budget_of_an_axle_is_kept(case):
     s, b = case.settings, case.before
     total = [motor + brake for _, motor, brake, *_ in case.wheels()]
     for k, budget in (
-        (0, s.front_yaw_nm + s.front_yaw_growth_nmps * b.front_unequal_s),
-        (2, s.rear_yaw_nm + s.rear_yaw_growth_nmps * b.rear_unequal_s),
+        (0, min(s.front_yaw_nm + s.front_yaw_growth_nmps * b.front_unequal_s, s.front_yaw_most_nm)),
+        (2, min(s.rear_yaw_nm + s.rear_yaw_growth_nmps * b.rear_unequal_s, s.rear_yaw_most_nm)),
     ):
         axle = case.axle(k)
         moment = abs(total[k] - total[k + 1]) / axle.wheel.radius_m * 0.5 * axle.track_width_m
@@ -298,7 +316,7 @@ def mirrored(case):
 
 
 def left_and_right_exchanged_exchange_the_command(case):
-    command, after = law.step(*mirrored(case), case.settings, case.car, TABLE)
+    command, after = drive(*mirrored(case), case.settings, case.car, TABLE)
     for ours, other in (
         (case.command.motor_torque_nm, command.motor_torque_nm),
         (case.command.friction_torque_nm, command.friction_torque_nm),
@@ -418,7 +436,7 @@ def the_reasons_are_among_the_named_ones(case):
 
 
 def the_same_step_gives_the_same_bits(case):
-    again = law.step(case.m, case.before, case.settings, case.car, TABLE)
+    again = drive(case.m, case.before, case.settings, case.car, TABLE)
     assert again == (case.command, case.after)
 
 
@@ -440,6 +458,9 @@ def it_does_what_the_plain_law_does(case):
     def near(value):
         return pytest.approx(value, rel=1e-8, abs=1e-7)
 
+    for name in ("front", "rear"):
+        was, now = (getattr(state, f"{name}_unequal_s") for state in (case.before, after))
+        assert now in (near(was + case.m.dt_s), near(max(was - case.m.dt_s, 0.0)))
     ours = [(motor, brake) for _, motor, brake, *_ in case.wheels()]
     assert ours == [(near(a.motor), near(a.friction)) for a in wheels]
     assert [state.gated for state in after.wheels] == [a.gated for a in wheels]
@@ -536,7 +557,7 @@ def test_table_2_as_printed(slips, gate, parts):
     s = TABLE2._replace(strategy=RULE)
     table = TABLE._replace(rule=TABLE.rule * 0.0 + [0.0, 0.3, 0.0, 0.3])
     m = measurement(slips=slips, demand=-4000.0)
-    command, _ = law.step(m, initial_state(), s, CAR, table)
+    command, _ = drive(m, initial_state(), s, CAR, table)
     assert command.gate == gate
     assert (command.front_power_w, command.rear_power_w) == pytest.approx(tuple(-4000.0 * x for x in parts))
 
@@ -602,7 +623,7 @@ def test_no_minute_sees_more_changes_than_the_budget_and_one_bucket_whatever_is_
     # The demand leaps between what one axle and what both are best for, slowly enough to be no noise.
     for k in range(18_000):
         demand = 1000.0 if k // 60 % 2 else 14000.0
-        command, state = law.step(measurement(speed=10.0, demand=demand), state, s, car, table)
+        command, state = drive(measurement(speed=10.0, demand=demand), state, s, car, table)
         if abs(command.decided_share - share) > 0.25:
             changes.append(k * 0.01)
             share = command.decided_share
@@ -623,7 +644,7 @@ def test_what_one_axle_s_motors_cannot_give_the_other_s_do():
     table = TABLE._replace(rule=TABLE.rule * 0.0 + [0.0, 1.0, 0.0, 1.0])
     state = initial_state()
     for _ in range(100):
-        command, state = law.step(measurement(demand=22e3), state, s, CAR, table)
+        command, state = drive(measurement(demand=22e3), state, s, CAR, table)
     assert command.front_power_w == pytest.approx(15e3)
     assert command.rear_power_w == pytest.approx(7e3)
     assert command.limits == t.LIMIT_MOTOR
@@ -645,7 +666,7 @@ def test_an_axle_that_helps_out_up_to_its_limit_is_at_its_limit():
     preview = default_settings("preview")._replace(gate_mode=GATE_MODE_OFF)
     table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + 0.2)
     hot = memory(front={"heat": 1.0}, applied_share=0.2, decided_share=0.2)
-    command, _ = law.step(measurement(speed=5.0, demand=12e3), hot, preview, CAR, table)
+    command, _ = drive(measurement(speed=5.0, demand=12e3), hot, preview, CAR, table)
     assert command.limits & ~t.LIMIT_SLEW == t.LIMIT_MOTOR | t.LIMIT_THERMAL
 
 
@@ -687,9 +708,9 @@ def test_a_little_friction_is_told_like_much(front_share):
     table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + front_share)
     before = memory(applied_share=front_share, decided_share=front_share)
     demand = -2.0 * (80.0 + 0.5) * 15.0 / RADIUS
-    command, _ = law.step(measurement(demand=demand), before, preview, CAR, table)
+    command, _ = drive(measurement(demand=demand), before, preview, CAR, table)
     assert command.limits & ~t.LIMIT_SLEW == t.LIMIT_REGENERATION
-    command, _ = law.step(measurement(demand=demand + 100.0), before, preview, CAR, table)
+    command, _ = drive(measurement(demand=demand + 100.0), before, preview, CAR, table)
     assert command.limits & ~t.LIMIT_SLEW == 0
 
 
@@ -699,15 +720,15 @@ def test_rounding_is_no_limit():
     rolling = {"speed_radps": 15.0 / RADIUS}
     before = memory(rolling, rolling, applied_share=0.3, decided_share=0.3)
     for demand in range(1000, 8000, 37):
-        command, _ = law.step(measurement(demand=float(demand)), before, preview, CAR, table)
+        command, _ = drive(measurement(demand=float(demand)), before, preview, CAR, table)
         assert command.limits & ~t.LIMIT_SLEW == 0
 
 
 def test_a_speed_below_zero_is_standstill():
     m = measurement(speed=0.0, demand=2e3)
-    assert law.step(m._replace(speed_mps=-0.5), initial_state(), DEFAULT, CAR, TABLE) == law.step(
-        m, initial_state(), DEFAULT, CAR, TABLE
-    )
+    below, at = (drive(m._replace(speed_mps=v), initial_state(), DEFAULT, CAR, TABLE) for v in (-0.5, 0.0))
+    assert below[0]._replace(speed_mps=0.0) == at[0]
+    assert below[1] == at[1]
 
 
 def test_hard_braking_is_shared_by_motors_and_friction_brakes():
@@ -809,3 +830,137 @@ def test_the_limiter_holds_the_wheel_at_its_target_slip(demand, friction):
     assert max(map(abs, slips)) < 0.2
     assert set(gates) == {t.GATE_NONE}
     assert case.command.limits & t.LIMIT_SLIP
+
+
+# --- Direction: what the whole law makes of a car that moves the wrong way, or both ways ------------------------------
+
+
+def whole(m, state=None, s=DEFAULT):
+    return law.step(m, initial_state() if state is None else state, s, CAR, TABLE)
+
+
+def moving(speed, demand, direction=1.0):
+    return measurement(speed=0.0, demand=demand)._replace(
+        speed_mps=speed, wheel_speed_radps=(speed / RADIUS,) * 4, direction=direction
+    )
+
+
+def settled(m, steps=60, s=DEFAULT):
+    state = initial_state()
+    for _ in range(steps):
+        command, state = whole(m, state, s)
+    return command, state
+
+
+@pytest.mark.parametrize("speed", [-0.1, -0.5, -2.0, -8.0])
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_brakes_brake_backwards_as_forwards(speed, direction):
+    off = DEFAULT._replace(gate_mode=GATE_MODE_OFF)
+    back, _ = settled(moving(speed, -3000.0, direction), s=off)
+    ahead, _ = settled(moving(-speed, -3000.0), s=off)
+    assert back.friction_torque_nm == pytest.approx(ahead.friction_torque_nm)
+    assert back.motor_torque_nm == pytest.approx([-nm for nm in ahead.motor_torque_nm])
+    assert sum(back.friction_torque_nm) < -50.0 or sum(back.motor_torque_nm) > 50.0
+
+
+def test_a_car_that_rolls_back_is_braked_whatever_its_wheels_do():
+    rolling, state = settled(moving(-3.0, -9000.0))
+    locked = moving(-3.0, -9000.0)._replace(wheel_speed_radps=(-2.0,) * 4)
+    for _ in range(5):
+        command, state = whole(locked, state)
+        assert command.gated_wheels == 0
+        assert sum(command.friction_torque_nm) <= 0.8 * sum(rolling.friction_torque_nm)
+
+
+def test_reverse_drives_backwards_and_no_faster_than_it_may():
+    command, _ = settled(moving(0.0, 1500.0, -1.0))
+    assert max(command.motor_torque_nm) < -30.0
+    slow, fast, faster = (settled(moving(v, 1500.0, -1.0))[0] for v in (-2.0, -4.5, -5.0))
+    assert max(slow.motor_torque_nm) < 0.0
+    assert sum(fast.motor_torque_nm) == pytest.approx(-0.5 * 1500.0 / (4.5 / RADIUS), rel=1e-6)
+    assert faster.motor_torque_nm == (0.0,) * 4
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(-6.0, 6.0), st.floats(-20e3, 20e3), st.sampled_from([1.0, -1.0])), min_size=1, max_size=12
+    )
+)
+def test_no_motor_ever_grows_against_the_direction_asked_for(moves):
+    state = initial_state()
+    for speed, demand, direction in moves:
+        before = [state.travel * wheel.motor_nm for wheel in state.wheels]
+        command, state = whole(moving(speed, demand, direction), state)
+        for nm, was in zip(command.motor_torque_nm, before, strict=True):
+            if demand >= 0.0:
+                assert direction * nm >= min(direction * was, 0.0) - 1e-6
+        assert max(command.friction_torque_nm) <= 0.0
+
+
+def test_a_car_that_begins_to_roll_back_is_held_until_it_drives_off():
+    _, state = settled(moving(0.0, 0.0))
+    command, state = whole(moving(-0.05, 0.0), state)
+    assert command.hold_nm == 0.0
+    command, state = whole(moving(-0.07, 0.0), state)
+    hold = 0.25 * CAR.chassis.mass_kg * G * 0.25 * RADIUS
+    assert command.friction_torque_nm == pytest.approx((-hold,) * 4)
+    for _ in range(500):
+        command, state = whole(moving(0.0, 0.0), state)
+    assert command.friction_torque_nm == pytest.approx((-hold,) * 4), "as long as nobody drives"
+    faded = []
+    for _ in range(60):
+        command, state = whole(moving(0.0, 1500.0), state)
+        faded.append(command.hold_nm)
+    assert faded[0] == pytest.approx(hold)
+    assert faded[-1] == 0.0
+    assert faded == sorted(faded, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("speed", "demand", "direction", "held"),
+    [
+        (-0.07, 0.0, 1.0, True),
+        (-0.07, 0.0, -1.0, False),  # reverse is what is asked for
+        (0.07, 0.0, -1.0, True),
+        (0.07, 0.0, 1.0, False),
+        (-1.6, 0.0, 1.0, False),  # too fast to be a matter of holding
+        (-0.07, 1500.0, 1.0, True),
+    ],
+)
+def test_only_rolling_against_the_direction_asked_for_is_held(speed, demand, direction, held):
+    _, state = settled(moving(0.0, 0.0, direction), 3)
+    assert (whole(moving(speed, demand, direction), state)[0].hold_nm > 0.0) is held
+
+
+def test_a_held_car_that_moves_off_is_let_go():
+    _, state = settled(moving(0.0, 0.0), 3)
+    _, state = whole(moving(-0.07, 1500.0), state)
+    command, _ = whole(moving(0.07, 1500.0), state)
+    assert command.friction_torque_nm == (0.0,) * 4
+
+
+def test_the_yaw_budget_grows_while_it_is_used_and_goes_back_after():
+    rolling = 15.0 / RADIUS
+    split = measurement(demand=-40e3, wheel_speed_radps=(0.83 * rolling, rolling, rolling, rolling))
+    state = settle(measurement(demand=-40e3)).after
+    assert state.front_unequal_s == 0.0
+    differences = []
+    for _ in range(20):
+        case = take(split, state)
+        state = case.after
+        total = [motor + brake for _, motor, brake, *_ in case.wheels()]
+        differences.append(total[0] - total[1])
+    assert state.front_unequal_s == pytest.approx(0.2)
+    assert state.rear_unequal_s == 0.0
+    per_s = DEFAULT.front_yaw_growth_nmps * 2.0 * RADIUS / CAR.front.track_width_m
+    assert differences[0] == pytest.approx(DEFAULT.front_yaw_nm * 2.0 * RADIUS / CAR.front.track_width_m)
+    assert differences[15] - differences[10] == pytest.approx(0.05 * per_s)
+    for _ in range(20):
+        state = take(measurement(demand=-1000.0), state).after
+    assert state.front_unequal_s == pytest.approx(0.0, abs=1e-9)
+
+
+def test_below_walking_pace_no_brake_is_gated():
+    m = measurement(speed=0.9, demand=-3000.0, wheel_speed_radps=(0.0,) * 4)
+    assert take(m).command.gated_wheels == 0
+    assert take(m._replace(speed_mps=1.1)).command.gated_wheels == 15

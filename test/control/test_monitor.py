@@ -102,9 +102,9 @@ class TestSpeed:
         assert monitor.ages_s(NOW)[0] == 0.01
         assert math.isinf(monitor.ages_s(NOW)[1])
 
-    def test_noise_below_zero_is_standstill(self, monitor) -> None:
+    def test_a_speed_backwards_is_kept_as_it_is(self, monitor) -> None:
         assert monitor.take_speed(SpeedReading(NOW, -0.3), NOW)
-        assert monitor.speed_mps == 0.0
+        assert monitor.speed_mps == -0.3
 
     def test_the_first_speed_may_be_any(self, monitor) -> None:
         assert monitor.take_speed(SpeedReading(NOW, 59.0), NOW)

@@ -46,6 +46,12 @@ def grip(braking, road, wheel, speed, settings, axle):
     return max(-torque if braking else torque, 0.0)
 
 
+def slip_target(state, settings, braking):
+    """Slip the limiter steers to: less while left and right are braked unequally."""
+    unequal = braking and max(state.front_unequal_s, state.rear_unequal_s) > 0.03
+    return min(settings.slip_target, settings.unequal_slip_target) if unequal else settings.slip_target
+
+
 def battery_factor(torques, speeds, discharge, charge, motors):
     """Largest part of the torques inside the battery's limits, from the roots of the parabola the power is in it."""
     wheels = list(zip(torques, speeds, motors, strict=True))
@@ -88,6 +94,7 @@ class Wheel:
     slip: float = 0.0
     road: float = 0.0
     room: float = 0.0
+    own: float = 0.0  # room without the axle's budget
     most: float = 0.0
     grip: float = math.inf
     conversion: float = 0.0
@@ -107,6 +114,8 @@ class Pair:
     wheels: list
     unequal_s: float
     budget: float
+    unequal: bool = False
+    short: bool = False
     asked: float = 0.0
     given: float = 0.0
 
@@ -129,6 +138,8 @@ def step(m, state, settings, vehicle, decide):
     first = state.steps == 0
     braking = m.power_demand_w < 0.0
     bits = set()
+    settings = settings._replace(slip_target=slip_target(state, settings, braking))
+    standing = braking and m.speed_mps < settings.slip_speed_floor_mps
     wheels = [
         Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i])
         for i, speed in enumerate(m.wheel_speed_radps)
@@ -137,8 +148,13 @@ def step(m, state, settings, vehicle, decide):
         Pair(
             wheels[k : k + 2],
             getattr(state, f"{name}_unequal_s"),
-            getattr(settings, f"{name}_yaw_nm")
-            + getattr(settings, f"{name}_yaw_growth_nmps") * getattr(state, f"{name}_unequal_s"),
+            min(
+                getattr(settings, f"{name}_yaw_nm")
+                + getattr(settings, f"{name}_yaw_growth_nmps") * getattr(state, f"{name}_unequal_s"),
+                getattr(settings, f"{name}_yaw_most_nm"),
+            )
+            if braking
+            else getattr(settings, f"{name}_yaw_most_nm"),
         )
         for k, name in ((0, "front"), (2, "rear"))
     ]
@@ -166,16 +182,17 @@ def step(m, state, settings, vehicle, decide):
             own = axle.slip if settings.gate_mode == GATE_MODE_TABLE2 else wheel.slip
             edge = settings.critical_slip - (settings.gate_hysteresis if wheel.before.gated else 0.0)
             wheel.doubtful = abs(abs(own) - edge) < 1e-12
-            if settings.gate_mode != GATE_MODE_OFF and m.power_demand_w != 0.0:
+            if settings.gate_mode != GATE_MODE_OFF and m.power_demand_w != 0.0 and not standing:
                 spinning = settings.gate_driving and not braking and own > edge
                 wheel.gated = spinning or (braking and -own > edge)
             held = max(m.speed_mps * (1.0 - settings.critical_slip), floor) / wheel.axle.wheel.radius_m
-            wheel.conversion = max(wheel.speed, held)
+            turning = min(wheel.speed, 1.12 * m.speed_mps / wheel.axle.wheel.radius_m) if braking else wheel.speed
+            wheel.conversion = max(turning, held)
             brake = wheel.axle.friction_brake.max_torque_nm
             wheel.room = brake if braking else torque_limit(wheel.fast, wheel.before.heat, wheel.axle.motor)
             if settings.gate_mode == GATE_MODE_LIMITER:
                 wheel.grip = grip(braking, wheel.road, wheel.speed, m.speed_mps, settings, wheel.axle)
-            wheel.most = 0.0 if wheel.gated else min(wheel.room, wheel.grip)
+            wheel.own = wheel.most = 0.0 if wheel.gated else min(wheel.room, wheel.grip)
         weaker = min(wheel.most for wheel in axle.wheels)
         geometry = axle.wheels[0].axle
         most = weaker + 2.0 * axle.budget * geometry.wheel.radius_m / geometry.track_width_m
@@ -198,6 +215,8 @@ def step(m, state, settings, vehicle, decide):
         high = (axle.given - low * weak.conversion) / strong.conversion if low < equal else equal
         weak.total, strong.total = (-low, -high) if braking else (low, high)
         all_short = max(missing, axle.asked - axle.given) > 1e-12 * abs(m.power_demand_w)
+        axle.short, axle.unequal = all_short, low != high
+        weak.doubtful |= abs(equal - weak.most) <= 1e-9 * max(equal, 1.0)
         for wheel in axle.wheels:
             _torque(wheel, all_short or (wheel is weak and low < high), braking, m, settings, bits)
 

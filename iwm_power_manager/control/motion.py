@@ -1,0 +1,381 @@
+"""How fast the car moves, and which sensor is not believed: five speeds and the torques that were applied.
+
+The torques say what the speed does next: the road force is what turns neither motor nor brake into wheel acceleration
+(eq. 11), its sum is what accelerates the car (eq. 1). So there is a reference that no speed sensor can walk away with:
+it follows the forces, and each sensor may pull at it only as fast as a slope or an unknown load would. A sensor that
+leaves it, stands still while it moves, or contradicts four wheels that roll freely, is not believed until it has been
+near it again for a while. A believed speed sensor is taken as it is: on a healthy car this page changes nothing.
+
+A wheel is not believed when it does what no torque can: slows down faster than its brake can, or stays away from the
+car's speed although nothing holds it. A wheel that skids does neither.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from iwm_power_manager.control.types import Measurement, MotionState, Wheels, WheelState
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.chassis import GRAVITY_MPS2
+from iwm_power_manager.model.parameters import VehicleParams, Wheel
+
+#: What a speed sensor may pull the reference by, m/s2: a slope of 10 %; and part of the forces, for an unknown load.
+PULL_MPS2 = 1.0
+PULL_OF_FORCES = 0.2
+#: The same for the wheels while the speed sensor is not believed, and for both below `SLOW_MPS`, where static friction
+#: makes forces say little.
+WHEEL_PULL_MPS2 = 1.5
+SLOW_PULL_MPS2 = 8.0
+SLOW_MPS = 1.0
+#: A wheel within this part of the speed, and this, may be rolling: slip and tyre wear are no reason to pull.
+WHEEL_PART, WHEEL_MPS = 0.06, 0.2
+#: How fast a steady difference is taken for a slope, 1/s2, and the steepest slope, m/s2.
+BIAS_GAIN_PER_S2 = 1.5
+BIAS_MPS2 = 2.5
+BIAS_STEP_MPS = 0.3
+#: The same while the wheels confirm the sensor this well.
+CONFIRMED_GAIN_PER_S2 = 6.0
+CONFIRMED_PART, CONFIRMED_MPS = 0.02, 0.15
+#: A speed sensor this far from the reference is not believed: part of the speed, and m/s.
+SPEED_PART, SPEED_MPS = 0.03, 0.5
+#: A sensor that shows the same number for this long while the reference moved by this is stuck.
+STUCK_S, STUCK_MPS = 0.05, 0.3
+#: Wheels that agree this well and take less than this part of their load from the road are rolling; a speed sensor that
+#: is this far from them for this long is not believed.
+AGREE_PART, AGREE_MPS = 0.04, 0.3
+ROLLING_FRICTION = 0.08
+APART_PART, APART_MPS, APART_S = 0.05, 0.5, 0.1
+#: A sensor must have been near the reference for this long before it is believed again.
+DISTRUST_S = 0.5
+#: Noise of a wheel's change in one step, rad/s; what a torque explains is taken times `TORQUE_MARGIN`.
+JUMP_RADPS = 1.5
+TORQUE_MARGIN = 1.5
+#: A wheel without torque (part of load times radius) and away from the car's speed comes back at least as fast as on
+#: the smoothest ice; one that does not for this long is a bad sensor. It is good again within the second pair.
+FREE_PART, ICE_FRICTION, RETURN_S = 0.05, 0.03, 0.06
+STRAY_PART, STRAY_MPS = 0.1, 0.5
+GOOD_PART, GOOD_MPS = 0.08, 0.5
+#: A sensor and wheels that differ by no more than this may both be right: tyres, or a wrong radius.
+LEAST_PART = 0.72
+#: No road force is larger than this part of the wheel's static load.
+MOST_FRICTION = 2.0
+#: Bits of `Motion.doubted`: the wheels in their order, then the speed sensor.
+DOUBT_SPEED = 16
+
+
+class Motion(NamedTuple):
+    """What is known of the car's motion.
+
+    Attributes
+    ----------
+    speed_mps : speed to use, negative backwards
+    uncertainty_mps : how wrong it may be
+    wheel_speed_radps : wheel speeds to use; one that is not believed has that of its axle's other wheel, or rolls
+    lower_part : the lower of two speeds, as part of the one used, where sensor and wheels differ by a quarter at most
+        and nothing tells which of them is wrong; else 1
+    doubted : bits of what is not believed: 1, 2, 4, 8 the wheels, 16 the speed sensor
+    """
+
+    speed_mps: float
+    uncertainty_mps: float
+    wheel_speed_radps: Wheels
+    lower_part: float
+    doubted: int
+
+
+NO_WHEELS = (0.0, 0.0, 0.0, 0.0)
+
+
+@kernel
+def _clamped(value: float, most: float) -> float:
+    return min(max(value, -most), most)
+
+
+@kernel
+def _road_nm(
+    torque_nm: float, change_radps: float, dt_s: float, doubted: bool, inertia: float, load_nm: float
+) -> float:
+    """Torque the road took from a wheel; of a wheel that is not believed, all of it."""
+    road = torque_nm if doubted else torque_nm - inertia * change_radps / dt_s
+    return _clamped(road, MOST_FRICTION * load_nm)
+
+
+@kernel
+def _wheel_doubt(
+    speed_radps: float,
+    change_radps: float,
+    torque_nm: float,
+    reference_mps: float,
+    acceleration_mps2: float,
+    dt_s: float,
+    stray_s: float,
+    doubt_s: float,
+    wheel: Wheel,
+    load_nm: float,
+) -> tuple[float, float]:
+    """How long a wheel has stayed away by now, and the time it has yet to be good."""
+    radius, inertia = wheel.radius_m, wheel.inertia_kgm2
+    size = abs(reference_mps)
+    direction = 1.0 if reference_mps >= 0.0 else -1.0
+    level = direction * (radius * speed_radps - reference_mps)
+    change = direction * change_radps
+    explained = direction * torque_nm / inertia * dt_s
+    rolling = direction * acceleration_mps2 / radius * dt_s
+    jumped = False
+    if size > SLOW_MPS:
+        # The road only ever drives a wheel towards the car's speed.
+        if level < 0.0:
+            jumped = change < TORQUE_MARGIN * min(explained, rolling, 0.0) - JUMP_RADPS
+        else:
+            jumped = change > TORQUE_MARGIN * max(explained, rolling, 0.0) + JUMP_RADPS
+    free = abs(torque_nm) < FREE_PART * load_nm
+    away = abs(level) > STRAY_PART * size + STRAY_MPS
+    if free and away and (-change if level > 0.0 else change) < ICE_FRICTION * load_nm / inertia * dt_s:
+        stray_s += dt_s
+    else:
+        stray_s = max(stray_s - dt_s, 0.0)
+    # A step that jumps away is a fault; one that jumps back is the end of it.
+    if (jumped and away) or stray_s > RETURN_S:
+        doubt_s = DISTRUST_S
+    elif doubt_s > 0.0 and abs(level) <= GOOD_PART * size + GOOD_MPS:
+        doubt_s = max(doubt_s - dt_s, 0.0)
+    return stray_s, doubt_s
+
+
+class _Rolling(NamedTuple):
+    """What the wheels that are believed say: how many, their rim speeds' extremes and mean, and whether they roll."""
+
+    believed: int
+    low_mps: float
+    high_mps: float
+    mean_mps: float
+    freely: bool
+
+
+@kernel
+def _rolling(rims: Wheels, doubt_s: Wheels, road: Wheels, front_nm: float, rear_nm: float) -> _Rolling:
+    """`front_nm`, `rear_nm` : road torque below which a wheel rolls freely."""
+    count = 0
+    low = math.inf
+    high = -math.inf
+    total = 0.0
+    for i in range(4):
+        if doubt_s[i] == 0.0:
+            count += 1
+            low = min(low, rims[i])
+            high = max(high, rims[i])
+            total += rims[i]
+    calm = max(abs(road[0]), abs(road[1])) < front_nm and max(abs(road[2]), abs(road[3])) < rear_nm
+    agree = count >= 3 and high - low <= AGREE_PART * abs(high) + AGREE_MPS
+    return _Rolling(count, low, high, total / max(count, 1), calm and agree)
+
+
+class _Sensor(NamedTuple):
+    """The speed sensor after judgement: as in `MotionState`, with the speed that is predicted now."""
+
+    predicted_mps: float
+    shown_s: float
+    moved_mps: float
+    apart_s: float
+    doubt_s: float
+
+
+@kernel
+def _judge_speed(
+    shown: float, predicted: float, acceleration: float, dt: float, before: MotionState, rolling: _Rolling
+) -> _Sensor:
+    """Whether the speed sensor is believed."""
+    if math.isnan(shown):
+        return _Sensor(predicted, 0.0, 0.0, 0.0, before.doubt_s)
+    same = shown == before.shown_mps
+    shown_s = before.shown_s + dt if same else 0.0
+    moved = before.moved_mps + acceleration * dt if same else 0.0
+    apart = 0.0
+    if rolling.freely and abs(shown - rolling.mean_mps) > APART_PART * abs(rolling.mean_mps) + APART_MPS:
+        apart = before.apart_s + dt
+        if apart > APART_S and before.doubt_s == 0.0:
+            predicted = rolling.mean_mps  # four against one, and nothing that could make them slip
+    tolerance = SPEED_PART * abs(predicted) + SPEED_MPS
+    error = abs(shown - predicted)
+    far = error > tolerance and abs(predicted) > SLOW_MPS
+    doubt = before.doubt_s
+    if far or apart > APART_S or (shown_s > STUCK_S and abs(moved) > STUCK_MPS):
+        doubt = DISTRUST_S
+    elif error <= 0.5 * tolerance:
+        doubt = max(doubt - dt, 0.0)
+    return _Sensor(predicted, shown_s, moved, apart, doubt)
+
+
+@kernel
+def _pulled(
+    predicted: float, shown: float, trusted: bool, rolling: _Rolling, demand_w: float, forces: float, dt: float
+) -> float:
+    """The reference: what the forces predict, pulled at by sensor and wheels."""
+    size = abs(predicted)
+    slow = size <= SLOW_MPS
+    reference = predicted
+    if trusted:
+        pull = SLOW_PULL_MPS2 if slow else PULL_MPS2 + PULL_OF_FORCES * abs(forces)
+        reference += _clamped(shown - predicted, pull * dt)
+    if rolling.believed > 0:
+        # A braked wheel is never faster than the car, a driven one never slower.
+        best = rolling.mean_mps
+        if demand_w < 0.0:
+            best = rolling.high_mps if predicted >= 0.0 else rolling.low_mps
+        elif demand_w > 0.0:
+            best = rolling.low_mps if predicted >= 0.0 else rolling.high_mps
+        error = best - predicted
+        if abs(error) > WHEEL_PART * size + WHEEL_MPS:
+            pull = PULL_MPS2
+            if not trusted:
+                pull = SLOW_PULL_MPS2 if slow else WHEEL_PULL_MPS2 + PULL_OF_FORCES * abs(forces)
+            reference += _clamped(error, pull * dt)
+    return reference
+
+
+@kernel
+def _forces_mps2(road: Wheels, vehicle: VehicleParams) -> float:
+    """Acceleration by the road's forces alone."""
+    front = (road[0] + road[1]) / vehicle.front.wheel.radius_m
+    rear = (road[2] + road[3]) / vehicle.rear.wheel.radius_m
+    return (front + rear) / vehicle.chassis.mass_kg
+
+
+@kernel
+def _resistance_mps2(speed_mps: float, vehicle: VehicleParams) -> float:
+    """Deceleration by air and rolling."""
+    c = vehicle.chassis
+    drag = 0.5 * c.air_density_kgpm3 * c.drag_coefficient * c.frontal_area_m2 * speed_mps * abs(speed_mps)
+    return drag / c.mass_kg + c.rolling_resistance * GRAVITY_MPS2 * _clamped(speed_mps / SLOW_MPS, 1.0)
+
+
+@kernel
+def _started(shown: float, rims: Wheels) -> MotionState:
+    """The first step of a run: the wheels are taken as rolling, and the sensor is believed if it agrees."""
+    start = _middle(rims)
+    if not math.isnan(shown) and abs(shown - start) <= SPEED_PART * abs(start) + SPEED_MPS:
+        start = shown
+    return MotionState(start, 0.0, shown, 0.0, 0.0, 0.0, 0.0, NO_WHEELS, NO_WHEELS)
+
+
+@kernel
+def estimate(
+    measurement: Measurement,
+    before: MotionState,
+    wheels: tuple[WheelState, WheelState, WheelState, WheelState],
+    travel: float,
+    first: bool,
+    vehicle: VehicleParams,
+) -> tuple[Motion, MotionState]:
+    """The car's motion now.
+
+    Parameters
+    ----------
+    measurement : speeds, negative backwards; a speed that is not known is NaN
+    before : of the step before
+    wheels : what the law remembers of them, in the direction of travel
+    travel : 1 if that was forwards, -1 backwards
+    first : the first step of a run: nothing is known from before
+    """
+    shown = measurement.speed_mps
+    w = measurement.wheel_speed_radps
+    dt = measurement.dt_s
+    chassis = vehicle.chassis
+    front, rear = vehicle.front.wheel, vehicle.rear.wheel
+    weight = chassis.mass_kg * GRAVITY_MPS2 / (chassis.front_axle_to_cg_m + chassis.rear_axle_to_cg_m)
+    # Load of a wheel times its radius: the torque of a road of friction 1.
+    front_nm = 0.5 * weight * chassis.rear_axle_to_cg_m * front.radius_m
+    rear_nm = 0.5 * weight * chassis.front_axle_to_cg_m * rear.radius_m
+    rims = (w[0] * front.radius_m, w[1] * front.radius_m, w[2] * rear.radius_m, w[3] * rear.radius_m)
+    if first:
+        before = _started(shown, rims)
+    a, b, c, d = wheels
+    torque = (travel * a.total_nm, travel * b.total_nm, travel * c.total_nm, travel * d.total_nm)
+    change = NO_WHEELS
+    if not first:
+        change = (
+            w[0] - travel * a.speed_radps,
+            w[1] - travel * b.speed_radps,
+            w[2] - travel * c.speed_radps,
+            w[3] - travel * d.speed_radps,
+        )
+    old = before.wheel_doubt_s
+    road = (
+        _road_nm(torque[0], change[0], dt, old[0] > 0.0, front.inertia_kgm2, front_nm),
+        _road_nm(torque[1], change[1], dt, old[1] > 0.0, front.inertia_kgm2, front_nm),
+        _road_nm(torque[2], change[2], dt, old[2] > 0.0, rear.inertia_kgm2, rear_nm),
+        _road_nm(torque[3], change[3], dt, old[3] > 0.0, rear.inertia_kgm2, rear_nm),
+    )
+    forces = _forces_mps2(road, vehicle)
+    acceleration = 0.0
+    if abs(before.speed_mps) > SLOW_MPS and not first:
+        acceleration = forces - _resistance_mps2(before.speed_mps, vehicle) + before.bias_mps2
+    predicted = before.speed_mps + acceleration * dt
+
+    stray = before.wheel_stray_s
+    s0, d0 = _wheel_doubt(w[0], change[0], torque[0], predicted, acceleration, dt, stray[0], old[0], front, front_nm)
+    s1, d1 = _wheel_doubt(w[1], change[1], torque[1], predicted, acceleration, dt, stray[1], old[1], front, front_nm)
+    s2, d2 = _wheel_doubt(w[2], change[2], torque[2], predicted, acceleration, dt, stray[2], old[2], rear, rear_nm)
+    s3, d3 = _wheel_doubt(w[3], change[3], torque[3], predicted, acceleration, dt, stray[3], old[3], rear, rear_nm)
+    doubt = (d0, d1, d2, d3)
+    rolling = _rolling(rims, doubt, road, ROLLING_FRICTION * front_nm, ROLLING_FRICTION * rear_nm)
+    sensor = _judge_speed(shown, predicted, acceleration, dt, before, rolling)
+    trusted = not math.isnan(shown) and sensor.doubt_s == 0.0
+    reference = _pulled(sensor.predicted_mps, shown, trusted, rolling, measurement.power_demand_w, forces, dt)
+    bias = before.bias_mps2
+    if trusted and abs(sensor.predicted_mps) > SLOW_MPS:
+        confirmed = abs(shown - rolling.mean_mps) <= CONFIRMED_PART * abs(shown) + CONFIRMED_MPS
+        gain = CONFIRMED_GAIN_PER_S2 if confirmed and rolling.believed >= 3 else BIAS_GAIN_PER_S2
+        step = gain * _clamped(shown - sensor.predicted_mps, BIAS_STEP_MPS) * dt
+        bias = _clamped(bias + step, BIAS_MPS2)
+
+    used = shown if trusted else reference
+    part = 1.0
+    if not (trusted or math.isnan(shown)) and abs(reference) > SLOW_MPS:
+        ratio = shown / reference
+        if LEAST_PART < ratio < 1.0:
+            part = ratio
+    doubted = 0 if trusted else DOUBT_SPEED
+    for i in range(4):
+        if doubt[i] > 0.0:
+            doubted |= 1 << i
+    motion = Motion(
+        speed_mps=used,
+        uncertainty_mps=0.1 + SPEED_PART * abs(used) if trusted else SPEED_MPS + 2.0 * WHEEL_PART * abs(used),
+        wheel_speed_radps=(
+            _used(w[0], d0, w[1], d1, used / front.radius_m),
+            _used(w[1], d1, w[0], d0, used / front.radius_m),
+            _used(w[2], d2, w[3], d3, used / rear.radius_m),
+            _used(w[3], d3, w[2], d2, used / rear.radius_m),
+        ),
+        lower_part=part,
+        doubted=doubted,
+    )
+    after = MotionState(
+        speed_mps=reference,
+        bias_mps2=bias,
+        shown_mps=shown,
+        shown_s=sensor.shown_s,
+        moved_mps=sensor.moved_mps,
+        apart_s=sensor.apart_s,
+        doubt_s=sensor.doubt_s,
+        wheel_stray_s=(s0, s1, s2, s3),
+        wheel_doubt_s=doubt,
+    )
+    return motion, after
+
+
+@kernel
+def _middle(rims: Wheels) -> float:
+    """Mean of the two middle ones."""
+    low = min(rims[0], rims[1], rims[2], rims[3])
+    high = max(rims[0], rims[1], rims[2], rims[3])
+    return 0.5 * (rims[0] + rims[1] + rims[2] + rims[3] - low - high)
+
+
+@kernel
+def _used(own: float, own_doubt_s: float, other: float, other_doubt_s: float, rolling: float) -> float:
+    if own_doubt_s == 0.0:
+        return own
+    return other if other_doubt_s == 0.0 else rolling

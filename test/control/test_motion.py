@@ -1,0 +1,184 @@
+"""The motion estimate: which sensor is believed, on roads whose every force is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from iwm_power_manager.control import law
+from iwm_power_manager.control.motion import DOUBT_SPEED, estimate
+from iwm_power_manager.control.settings import default_settings
+from iwm_power_manager.control.table import empty_table
+from iwm_power_manager.control.types import Measurement, initial_state
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+
+CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+RADIUS, INERTIA, MASS = CAR.front.wheel.radius_m, CAR.front.wheel.inertia_kgm2, CAR.chassis.mass_kg
+DT = 0.01
+NAMES = ("front_left", "front_right", "rear_left", "rear_right")
+
+
+def resistance(v):
+    c = CAR.chassis
+    drag = 0.5 * c.air_density_kgpm3 * c.drag_coefficient * c.frontal_area_m2 * v * v
+    return drag / MASS + c.rolling_resistance * 9.81
+
+
+class Car:
+    """A car that rolls without slip under a torque at each wheel; a slope it is not told of; sensors one can spoil."""
+
+    def __init__(self, speed=20.0, grade_mps2=0.0, mass_kg=MASS):
+        self.v, self.grade, self.mass = speed, grade_mps2, mass_kg
+        self.state = initial_state()
+        self.rim = [speed / RADIUS] * 4
+        self.motion = None
+
+    def step(self, torque=0.0, spoil_speed=lambda v: v, spoil_wheels=lambda w: w, demand=None, wheels=None):
+        """One step with this torque at each wheel; `wheels`: rim speeds of wheels that slip."""
+        shown = tuple(spoil_wheels(self.rim))
+        demand = torque if demand is None else demand
+        m = Measurement(spoil_speed(self.v), shown, float(demand), DT, 0.9, 1e5, 1e5, 0.5)
+        self.motion, after = estimate(m, self.state.motion, self.state.wheels, 1.0, self.state.steps == 0, CAR)
+        memory = tuple(
+            wheel._replace(total_nm=float(torque), speed_radps=float(w))
+            for wheel, w in zip(self.state.wheels, shown, strict=True)
+        )
+        self.state = self.state._replace(steps=self.state.steps + 1, motion=after, wheels=memory)
+        self.v += DT * (
+            4.0 * torque / RADIUS / (self.mass + 4.0 * INERTIA / RADIUS**2) - resistance(self.v) - self.grade
+        )
+        self.rim = [self.v / RADIUS] * 4 if wheels is None else list(wheels(self.v))
+        return self.motion
+
+
+@pytest.mark.parametrize("torque", [-600.0, -150.0, 0.0, 100.0, 200.0])
+@pytest.mark.parametrize(("grade", "mass"), [(0.0, 800.0), (1.9, 800.0), (-1.9, 800.0), (0.0, 1100.0)])
+def test_a_true_sensor_is_taken_as_it_is_on_any_slope_and_with_any_load(torque, grade, mass):
+    car = Car(25.0, grade, mass)
+    for _ in range(250):
+        v = car.v
+        if v < 2.0:
+            break
+        motion = car.step(torque)
+        assert motion.speed_mps == v
+        assert motion.doubted == 0
+        assert motion.wheel_speed_radps == (v / RADIUS,) * 4
+        assert motion.lower_part == 1.0
+
+
+def test_noise_is_no_reason_to_doubt():
+    rng = np.random.default_rng(1)
+    car = Car(20.0)
+    for k in range(1500):
+        car.step(
+            (100.0, -150.0)[k // 100 % 2],
+            lambda v: v + 0.1 * float(rng.standard_normal()),
+            lambda w: [x + 0.2 * float(rng.standard_normal()) for x in w],
+        )
+        assert car.motion.doubted == 0
+
+
+SPOILT = {
+    "half": lambda v, t: 0.5 * v,
+    "double": lambda v, t: 2.0 * v,
+    "high": lambda v, t: 1.2 * v,
+    "offset": lambda v, t: v + 5.0,
+    "walks up": lambda v, t: v + 5.0 * t,
+    "walks down": lambda v, t: v - 5.0 * t,
+    "stuck": lambda v, t: 20.0,
+    "missing": lambda v, t: math.nan,
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+@pytest.mark.parametrize("torque", [-300.0, -150.0, 60.0])
+def test_a_wrong_speed_sensor_is_named_and_the_speed_stays_right(name, torque):
+    car = Car(20.0)
+    for _ in range(50):
+        car.step(0.0)
+    start, found = car.v, None
+    car.v = start if name != "stuck" else 20.0
+    for k in range(150):
+        v = car.v
+        if v < 3.0:
+            break
+        motion = car.step(torque, lambda v, k=k: SPOILT[name](v, (k + 1) * DT))
+        if motion.doubted & DOUBT_SPEED and found is None:
+            found = k * DT
+        assert motion.doubted & 15 == 0
+        if found is not None:
+            assert motion.speed_mps == pytest.approx(v, abs=0.06 * v + 0.7)
+    assert found is not None
+    assert found <= (1.2 if name == "stuck" else 0.6)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.75, 1.25, 0.0])
+@pytest.mark.parametrize("which", [(0,), (3,), (0, 1, 2, 3)])
+def test_wheels_that_jump_are_not_believed_and_the_sensor_is(factor, which):
+    car = Car(20.0)
+    for _ in range(30):
+        car.step(-100.0)
+    for _ in range(60):
+        v = car.v
+        motion = car.step(-100.0, spoil_wheels=lambda w: [x * factor if i in which else x for i, x in enumerate(w)])
+        assert motion.speed_mps == v
+    assert motion.doubted == sum(1 << i for i in which)
+    assert motion.wheel_speed_radps == pytest.approx((v / RADIUS,) * 4)
+    for _ in range(70):
+        motion = car.step(-100.0)
+    assert motion.doubted == 0, "good again for long enough"
+
+
+def test_a_wheel_that_was_wrong_all_along_is_found_when_nothing_holds_it():
+    car = Car(20.0)
+    for _ in range(30):
+        motion = car.step(0.0, spoil_wheels=lambda w: [w[0], w[1], 0.6 * w[2], w[3]])
+    assert motion.doubted == 4
+    assert motion.wheel_speed_radps[2] == motion.wheel_speed_radps[3]
+
+
+@pytest.mark.parametrize("friction", [0.1, 0.2])
+def test_wheels_that_really_skid_are_believed(friction):
+    # The brakes take what the road cannot give: each wheel slows down by the difference.
+    car, rim = Car(15.0), [15.0 / RADIUS] * 4
+    grip = friction * MASS * 9.81 / 4.0 * RADIUS
+    for _ in range(20):
+        car.step(0.0)
+    rim = car.v / RADIUS
+    for _ in range(25):
+        rim = max(rim - DT * (250.0 - grip) / INERTIA, 0.0)
+        v = car.v
+        car.step(-250.0, wheels=lambda v, rim=rim: [rim] * 4)
+        car.v = v - DT * friction * 9.81
+        assert car.motion.doubted == 0
+    assert car.motion.speed_mps == pytest.approx(car.v, abs=0.1)
+
+
+def test_without_any_believable_wheel_all_roll():
+    car = Car(20.0)
+    for _ in range(30):
+        car.step(-100.0)
+    motion = car.step(-100.0, spoil_wheels=lambda w: [0.0] * 4)
+    assert motion.wheel_speed_radps == pytest.approx((motion.speed_mps / RADIUS,) * 4)
+
+
+def test_where_nothing_tells_sensor_from_wheels_the_lower_speed_weakens_no_brake():
+    car = Car(20.0)
+    for _ in range(40):
+        motion = car.step(0.0, lambda v: 0.8 * v)
+    assert motion.doubted == DOUBT_SPEED
+    assert motion.lower_part == pytest.approx(0.8, abs=0.01)
+    assert all(car.step(0.0, lambda v: 0.5 * v).lower_part == 1.0 for _ in range(3))
+
+
+def test_the_estimate_goes_into_the_law():
+    state, s = initial_state(), default_settings("equal")
+    rolling = (20.0 / RADIUS,) * 4
+    for _ in range(30):
+        m = Measurement(30.0, rolling, 0.0, DT, 0.9, 1e5, 1e5, 0.5)
+        command, state = law.step(m, state, s, CAR, empty_table())
+    assert command.doubted == DOUBT_SPEED
+    assert command.speed_mps == pytest.approx(20.0, abs=0.5)
