@@ -26,7 +26,14 @@ from typing import NamedTuple
 from iwm_power_manager.control.motion import Motion, estimate
 from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, GATE_MODE_TABLE2, Settings
 from iwm_power_manager.control.slew import slewed
-from iwm_power_manager.control.slip import UNLIMITED_NM, filtered, road_torque_nm, torque_room_nm, worse_slip
+from iwm_power_manager.control.slip import (
+    UNLIMITED_NM,
+    filtered,
+    gained_radps,
+    road_torque_nm,
+    torque_room_nm,
+    worse_slip,
+)
 from iwm_power_manager.control.split import split
 from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import (
@@ -141,11 +148,13 @@ def _wheel(
     dt_s: float,
     first: bool,
     before: WheelState,
+    other_radps: float,
+    other_before: WheelState,
     axle: Axle,
     settings: Settings,
     vehicle: VehicleParams,
 ) -> Wheel:
-    """Steps 1, 3 and 4 for one wheel; `gate_slip` is the slip its gate goes by."""
+    """Steps 1, 3 and 4 for one wheel; `gate_slip` is the slip its gate goes by, `other` the axle's other wheel."""
     braking = demand_w < 0.0
     radius = axle.wheel.radius_m
     # A braked wheel is not faster than the car: one that seems to be must not weaken the brakes.
@@ -158,7 +167,8 @@ def _wheel(
     fast = max(wheel_speed_radps, conversion)
     road = 0.0
     if not first:
-        taken = road_torque_nm(before.total_nm, before.speed_radps, wheel_speed_radps, dt_s, axle.wheel.inertia_kgm2)
+        gained = gained_radps(before, wheel_speed_radps, other_before, other_radps, radius)
+        taken = road_torque_nm(before.total_nm, gained, dt_s, axle.wheel.inertia_kgm2)
         road = filtered(before.road_nm, taken, dt_s, settings.slip_filter_s)
     gated = False
     # The brakes have to be able to hold a car at rest: what is slip there, sensors cannot tell.
@@ -361,20 +371,20 @@ def drive(
     fl_gate, fr_gate = (front_slip, front_slip) if printed else (fl_slip, fr_slip)
     rl_gate, rr_gate = (rear_slip, rear_slip) if printed else (rl_slip, rr_slip)
     fl = _wheel(
-        w[0], fl_slip, fl_gate, speed, demand, gain[0], lower_part, gate_mode, target, dt, first, fl0, front,
-        settings, vehicle,
+        w[0], fl_slip, fl_gate, speed, demand, gain[0], lower_part, gate_mode, target, dt, first, fl0, w[1], fr0,
+        front, settings, vehicle,
     )  # fmt: skip
     fr = _wheel(
-        w[1], fr_slip, fr_gate, speed, demand, gain[1], lower_part, gate_mode, target, dt, first, fr0, front,
-        settings, vehicle,
+        w[1], fr_slip, fr_gate, speed, demand, gain[1], lower_part, gate_mode, target, dt, first, fr0, w[0], fl0,
+        front, settings, vehicle,
     )  # fmt: skip
     rl = _wheel(
-        w[2], rl_slip, rl_gate, speed, demand, gain[2], lower_part, gate_mode, target, dt, first, rl0, rear,
-        settings, vehicle,
+        w[2], rl_slip, rl_gate, speed, demand, gain[2], lower_part, gate_mode, target, dt, first, rl0, w[3], rr0,
+        rear, settings, vehicle,
     )  # fmt: skip
     rr = _wheel(
-        w[3], rr_slip, rr_gate, speed, demand, gain[3], lower_part, gate_mode, target, dt, first, rr0, rear,
-        settings, vehicle,
+        w[3], rr_slip, rr_gate, speed, demand, gain[3], lower_part, gate_mode, target, dt, first, rr0, w[2], rl0,
+        rear, settings, vehicle,
     )  # fmt: skip
     front_gated = fl.gated and fr.gated
     rear_gated = rl.gated and rr.gated

@@ -8,6 +8,7 @@ almost its peak force, instead of letting it swing across the critical slip as T
 
 from __future__ import annotations
 
+from iwm_power_manager.control.types import WheelState
 from iwm_power_manager.jit import kernel
 
 #: The limiter never steers to less than this slip speed, m/s: at walking pace a slip of 0.15 is within the noise.
@@ -30,11 +31,22 @@ def filtered(previous: float, value: float, dt_s: float, time_constant_s: float)
 
 
 @kernel
-def road_torque_nm(
-    applied_nm: float, speed_before_radps: float, speed_radps: float, dt_s: float, inertia: float
-) -> float:
-    """Torque the road took from a wheel over the last step (eq. 11 solved for r F)."""
-    return applied_nm - inertia * (speed_radps - speed_before_radps) / dt_s
+def gained_radps(own: WheelState, own_radps: float, other: WheelState, other_radps: float, radius_m: float) -> float:
+    """What a wheel has gained in speed since the last step, with its axle's other wheel to tell noise from slip.
+
+    Two wheels that differ by less than the least slip speed turn alike as far as anybody can tell, so that the mean of
+    both says it better than each by itself: noise of a sensor, divided by a short step, is a large torque.
+    """
+    own_gain = own_radps - own.speed_radps
+    if abs(own_radps - other_radps) * radius_m >= LEAST_SLIP_SPEED_MPS:
+        return own_gain
+    return 0.5 * (own_gain + (other_radps - other.speed_radps))
+
+
+@kernel
+def road_torque_nm(applied_nm: float, gained_radps: float, dt_s: float, inertia: float) -> float:
+    """Torque the road took from a wheel that has gained so much speed over the last step (eq. 11 solved for r F)."""
+    return applied_nm - inertia * gained_radps / dt_s
 
 
 @kernel

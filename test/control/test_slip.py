@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iwm_power_manager.control.slip import UNLIMITED_NM, filtered, road_torque_nm, torque_room_nm, worse_slip
+from iwm_power_manager.control.slip import (
+    UNLIMITED_NM,
+    filtered,
+    gained_radps,
+    road_torque_nm,
+    torque_room_nm,
+    worse_slip,
+)
+from iwm_power_manager.control.types import initial_state
 from oracles import control_law as oracle
 
 RADIUS, INERTIA = 0.33, 1.1
@@ -42,9 +50,9 @@ def test_a_filter_covers_63_percent_of_a_step_in_its_time_constant():
 
 
 def test_the_road_takes_what_does_not_turn_the_wheel():
-    assert road_torque_nm(50.0, 30.0, 30.0, 0.01, INERTIA) == 50.0
+    assert road_torque_nm(50.0, 0.0, 0.01, INERTIA) == 50.0
     # 20 N m speed the wheel up by 0.1818 rad/s in 0.01 s; the other 30 went into the road.
-    assert road_torque_nm(50.0, 30.0, 30.0 + 20.0 * 0.01 / INERTIA, 0.01, INERTIA) == pytest.approx(30.0)
+    assert road_torque_nm(50.0, 20.0 * 0.01 / INERTIA, 0.01, INERTIA) == pytest.approx(30.0)
 
 
 SETTINGS = st.builds(
@@ -91,3 +99,13 @@ def test_a_car_at_rest_can_start():
     assert torque_room_nm(False, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == pytest.approx(
         0.3 / RADIUS * INERTIA / 0.03
     )
+
+
+@given(st.floats(-50.0, 50.0), st.floats(-5.0, 5.0), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
+def test_wheels_that_turn_alike_share_what_they_gain_and_others_have_their_own(before, apart, own_gain, other_gain):
+    wheel = initial_state().wheels[0]
+    own, other = wheel._replace(speed_radps=before), wheel._replace(speed_radps=before + apart)
+    now, there = own.speed_radps + own_gain, other.speed_radps + other_gain
+    gained = gained_radps(own, now, other, there, RADIUS)
+    mean = pytest.approx(0.5 * (own_gain + other_gain), abs=1e-9)
+    assert gained == (mean if abs(now - there) * RADIUS < 0.3 else pytest.approx(own_gain, abs=1e-9))

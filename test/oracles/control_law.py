@@ -159,11 +159,15 @@ def step(m, state, settings, vehicle, decide):
         for k, name in ((0, "front"), (2, "rear"))
     ]
 
-    for wheel in wheels:
+    for k, wheel in enumerate(wheels):
         now = slip(wheel.speed, m.speed_mps, wheel.axle.wheel.radius_m, settings.slip_speed_floor_mps)
         wheel.slip = now if first else low_pass(wheel.before.slip, now, m.dt_s, settings.slip_filter_s)
         if not first:
+            other = wheels[k ^ 1]
+            alike = abs(wheel.speed - other.speed) * wheel.axle.wheel.radius_m < 0.3
             change = (wheel.speed - wheel.before.speed_radps) / m.dt_s
+            if alike:  # the mean of both says it better
+                change = 0.5 * (change + (other.speed - other.before.speed_radps) / m.dt_s)
             taken = wheel.before.total_nm - wheel.axle.wheel.inertia_kgm2 * change
             wheel.road = low_pass(wheel.before.road_nm, taken, m.dt_s, settings.slip_filter_s)
 
