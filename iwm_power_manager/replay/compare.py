@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 #: Stamps one side may be ahead of the other before they count as having no counterpart.
@@ -67,10 +67,12 @@ class TopicComparer:
     ----------
     topic : its name
     tolerance : largest absolute difference that is none
+    younger : names that an older record may lack: they are not compared then
     """
 
-    def __init__(self, topic: str, tolerance: float) -> None:
+    def __init__(self, topic: str, tolerance: float, younger: Collection[str] = ()) -> None:
         self._topic = topic
+        self._younger = younger
         self._tolerance = tolerance
         self._waiting: tuple[OrderedDict[int, _Side], OrderedDict[int, _Side]] = (OrderedDict(), OrderedDict())
         self._unpaired = [0, 0]
@@ -123,6 +125,8 @@ class TopicComparer:
         found = dict(zip(recorded.names, recorded.values, strict=False))
         beyond: Difference | None = None
         for name, value in zip(recomputed.names, recomputed.values, strict=True):
+            if name not in found and name in self._younger:
+                continue
             was = found.get(name, math.nan)
             difference = _distance(was, value)
             self._squares += difference * difference

@@ -8,7 +8,6 @@ steps are made from the mapped input signals.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -103,7 +102,9 @@ class Replay:
         self._steps = 0
         self._stamps = (0, 0)
         self._comparers = {
-            kind: TopicComparer(name, tolerance) for kind, name in self._names.items() if name is not None
+            kind: TopicComparer(name, tolerance, YOUNGER_SIGNALS if kind == STATE else ())
+            for kind, name in self._names.items()
+            if name is not None
         }
         self._decoders = {
             name: (kind, joint_state_reader("position" if kind == STATE else "effort"))
@@ -221,8 +222,9 @@ class Replay:
         if kind == STATE and list(names) == SIGNAL_NAMES:
             names, values = DECIDED_NAMES, values[_FIRST_DECIDED : _FIRST_DECIDED + len(DECIDED_NAMES)]
         elif kind == STATE:
-            found = YOUNGER_SIGNALS | dict(zip(names, values, strict=True))
-            names, values = DECIDED_NAMES, tuple(found.get(name, math.nan) for name in DECIDED_NAMES)
+            found = dict(zip(names, values, strict=True))
+            names = tuple(name for name in DECIDED_NAMES if name in found)
+            values = tuple(found[name] for name in names)
         self._comparers[kind].recorded(recorded.stamp_ns, message.log_time_ns, names, values)
         return steps
 
