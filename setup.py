@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build description, read alike by colcon (`ros.ament_python`) and by pip. Name and version stand in package.xml."""
 
 from __future__ import annotations

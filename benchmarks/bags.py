@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags: messages per second written, read, replayed and recorded over DDS, beside other writers and bare reading.
 
     python benchmarks/bags.py                 all but the recording over DDS

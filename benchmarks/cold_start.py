@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Seconds from nothing to the first command: the control law's first step from an empty and from a full kernel cache.
 
 Each run is a process of its own: import, vehicle, policy, first step. `--peer FOLDER` runs another checkout beside it,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time from inputs to command over DDS beside a bare rclpy relay, and the period's jitter beside a bare timer's."""
 
 from __future__ import annotations

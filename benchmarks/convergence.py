@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Does the step matter? Energy of the four cycles at half the control step and at two plant steps to a control step.
 
 Exit code 1 where halving either changes a cycle's chemical energy by 0.1 % or more.

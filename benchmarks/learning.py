@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """Is what a recorded drive taught worth having? A policy learned from a drive beside one learned from standard cycles.
 
     python benchmarks/learning.py             the table of docs/bags.md

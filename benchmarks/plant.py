@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """What a plant step costs: along a straight line beside the bare longitudinal step, and in the plane beside both.
 
 All in one run, in turns, the fastest of several rounds each. Exit code 1 where the straight line, with battery, motors

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """What it costs to turn bytes into readings and commands into bytes: the signals' code beside rclpy's.
 
 Both do the same work, turn about, in one process; the ratio is that of the fastest rounds.

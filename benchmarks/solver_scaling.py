@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the solver's time and memory grow with the number of states: grid `fine`, with coarser and finer axes.
 
 Each size is solved in a process of its own, so that its peak memory is its own. `--states 1e7` takes minutes and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """NumPy archives (.npz) from strangers: bounded before anything is unpacked, without pickles."""
 
 from __future__ import annotations

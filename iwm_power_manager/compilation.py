@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kernels through numba: the part of `jit` that needs the compiler."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Drive cycles: CSV -> `Cycle`, every mistake named with its line.
 
 A file has the columns `time_s,speed_mps` and optionally `grade` (rise over run, uphill positive), in any order, after

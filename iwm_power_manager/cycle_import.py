@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A drive cycle out of a logged drive: units, gaps, noise. What is guessed or left out is said."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors a user can cause. The message is one line that says what, where, and what would be right."""
 
 from __future__ import annotations

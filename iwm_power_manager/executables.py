@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the installed commands run.
 
 To import compiled libraries takes seconds, and Ctrl-C would end that in a traceback from wherever it was. So a command

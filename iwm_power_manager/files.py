@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files at the edge: hashes, atomic writes, and YAML whose every mistake is named with its place.
 
 YAML is read strictly: a key that stands twice, something other than a mapping at the top, or a syntax error are

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A reduction gear between motor and wheel: the motor's numbers as the wheel has them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Axes, cell search and multilinear interpolation: one piece of code for the solver, the policy and the run time.
 
 An axis is a float64 array of strictly increasing points; it may have a single point, and then nothing depends on that

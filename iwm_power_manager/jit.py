@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The one numba decorator of the project.
 
 A kernel is compiled when it is first called, so importing one costs nothing and `--help` never waits for a compiler.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where compiled kernels are kept, and under which name: the name says everything they were made from.
 
 Numba's own cache watches only the file that a function stands in: after an edit to a function it calls, or to a

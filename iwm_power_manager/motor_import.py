@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A motor map out of a table of another program: rpm, percent, decimal commas, matrix layout, a gear."""
 
 from __future__ import annotations

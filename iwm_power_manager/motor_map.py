@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motor maps: a CSV of efficiencies over speed and torque -> losses on a grid, which reach as far as the motor does.
 
 What a map does not say is not made up in silence: a grid point inside the motor's limits that is missing, a torque or a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A car whose numbers do not fit each other: each check says which unit was probably meant.
 
 Ranges of single numbers stand in `vehicle_table`; here numbers are compared with each other. The bounds are far from

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The policy file: write it, verify it, and hand its tables to the control law.
 
 A policy is one `.npz` without pickles. Its members:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where the files that come with the package are: `config/`, `policies/`, `launch/`.
 
 They lie beside the package in a source checkout, below `share/iwm_power_manager` once installed by colcon or pip. No

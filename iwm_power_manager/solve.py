@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a car, a grid and a demand to a policy file: what every command that solves policies calls."""
 
 from __future__ import annotations

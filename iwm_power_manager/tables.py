@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables as other programs write them: any separator, decimal commas, comments. What was guessed is said."""
 
 from __future__ import annotations

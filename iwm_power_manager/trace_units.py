@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Units of a speed trace, told by its accelerations: what no car does is probably another unit."""
 
 from __future__ import annotations

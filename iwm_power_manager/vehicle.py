@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A car: its YAML file, checked value by value, and the frozen numbers the kernels take."""
 
 from __future__ import annotations

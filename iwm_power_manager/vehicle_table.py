@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every number of a vehicle file: unit, range, meaning, who reads it, and what holds where the file does not give it.
 
 The one table that `vehicle` checks files by and `docs/vehicle.md` prints. A tyre's own numbers stand with its model

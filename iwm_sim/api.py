@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The package from Python: load a car and its policies, look into them, drive, and get the numbers.
 
 >>> from iwm_sim import api

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Driver, control law and plant in one process: the simulator node's loop without ROS.
 
 The order within a step is the one the nodes keep in lock-step: sensors, driver, law, plant. The same kernels on the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A drive over DDS: recorder, power manager and simulator as processes on a domain of their own, and what they left.
 
 In lock-step the result does not depend on how fast they are; the same drive in one process has to give the same bits.

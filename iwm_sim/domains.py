@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A DDS domain that no other run on this machine uses.
 
 Two runs on one domain hear each other: a second car on the same topics. Each run holds a lock file for its domain, and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion of car and wheels in the plane: the double-track model, one implicit step.
 
 Seven degrees of freedom: forward and lateral speed of the centre of gravity (body axes: x forward, y to the left), yaw

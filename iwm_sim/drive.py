@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A driver and a car in a scenario, one step at a time.
 
 The closed loop of `closed_loop.run`, cut open where the control law stands: `sense` is what the law may know, `advance`

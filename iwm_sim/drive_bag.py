@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a bag of a drive holds: is everything there that was published, and what did the power manager decide."""
 
 from __future__ import annotations

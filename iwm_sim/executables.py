@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the installed commands of this package run; see `iwm_power_manager.executables`."""
 
 from __future__ import annotations

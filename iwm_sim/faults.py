@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What fails in a scenario: sensors, actuators and messages, from one time to another. Plain numbers, no ROS."""
 
 from __future__ import annotations

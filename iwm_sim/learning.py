@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Policies from recorded driving, kept only if they are no worse than one of standard cycles.
 
 Ten minutes of driving do not fill a transition matrix, and the driver's demand is no Markov chain. So how much a

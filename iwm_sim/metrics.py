@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a run amounts to: energy, trace, slip, share changes. Pure functions of a run's series."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When the simulator steps: answers awaited in lock-step, steps due in real time. Plain numbers, no ROS, no clock."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The car as it is: the higher-fidelity model, used for evaluation only.
 
 Beyond the control-oriented model it moves in the plane (`iwm_sim.double_track`), forwards and backwards, and has four

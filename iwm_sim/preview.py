@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Deterministic dynamic programming over a whole cycle known in advance.
 
 The bound nobody can beat: the split that costs least battery energy plus switching cost when every future demand is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Child processes that are started, watched and stopped together, and leave nothing running behind."""
 
 from __future__ import annotations

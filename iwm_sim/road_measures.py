@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a drive on a real road amounts to: how it stops, stays in its lane, holds, and what its wheels do meanwhile.
 
 Every measure is a function of a finished run; `NAMES` are what a scenario's `require` may bound. Those of a braking

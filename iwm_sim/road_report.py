@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `roads` says of scenarios: lines for the terminal, and the page of all of them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A scenario driven with the power manager in one process: what `make roads`, `evaluate` and the tests call.
 
 The power manager is `control.controller.Controller` as the node runs it in real time: its inputs are checked, aged and

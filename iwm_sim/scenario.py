@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenarios: what is driven, where, by whom, and what fails; one YAML file for `evaluate`, simulator, demo and `roads`.
 
     format: 1

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node `simulator`: a driver and a car on a drive cycle, as the rest of the vehicle would show itself on DDS.
 
 The car is `drive.Drive`, the same code and the same numbers as the closed loop in one process. This module gives it

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A driver who keeps the lane: the crossover model of steering, with one preview point.
 
 The driver looks a time ahead, sees how far beside the middle of the lane the car will be there, and turns the wheel so

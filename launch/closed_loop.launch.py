@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulator, power manager and, if wanted, recorder, for a ROS 2 Jazzy installation with launch_ros.
 
     ros2 launch iwm_power_manager closed_loop.launch.py cycle_file:=config/cycles/udds.csv strategy:=equal record:=true

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The power manager alone, for a car that is there already.
 
     ros2 launch iwm_power_manager power_manager.launch.py signals_file:=my_signals.yaml vehicle_file:=my_car.yaml

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recorded drive played to a power manager: the node decides anew on what the car once sent.
 
     ros2 launch iwm_power_manager replay.launch.py bag:=drive_01

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Small messages and topics for the tests of bags."""
 
 from __future__ import annotations

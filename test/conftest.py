@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What all tests share: an own DDS domain on this machine only, logs that leave no trace, Hypothesis profiles."""
 
 from __future__ import annotations

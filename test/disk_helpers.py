@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Disks that are full, and folders that may not be written, also for tests that run as root."""
 
 from __future__ import annotations

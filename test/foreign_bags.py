@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags as other people's recorders and other cars leave them: small, made anew for each test."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Short cycles and a small problem, so that a case takes a blink; `conftest.py` where they are used imports them."""
 
 from __future__ import annotations

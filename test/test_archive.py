@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """NumPy archives from strangers: what they would take is refused before it is taken."""
 
 from __future__ import annotations

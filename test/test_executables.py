@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ctrl-C ends an installed command cleanly, however early it comes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files: atomic writes, strict YAML, and checks that name file, key, value and range."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """docs/files.md states the limits that the code has."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cell search and multilinear interpolation against NumPy and SciPy."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A policy belongs to what the decision model reads: each number is turned, and the solver's tables decide."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Kernels: compiled when they are called, the same function from Python, from another kernel and over a pickle."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A kernel is found again exactly if everything it was made from is the same, and no folder can end a program."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motor maps: what is read, what is refused, and what of a motor a map has to cover."""
 
 from __future__ import annotations

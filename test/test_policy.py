@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The policy file: what is written comes back, the same bytes every time, and no damage gets through."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Files of the package are found from anywhere, a user's own file first."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whatever a file holds, a loader takes it or refuses it in one printable line: made, mutated and cut files."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Vehicle files: every key with every kind of bad value, curves and maps, and the identity of a car."""
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
 #!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
 """A car on another DDS: CycloneDDS and nothing of ROS. It publishes what it measures and obeys the torques it is sent.
 
     pip install -r requirements.txt        # in an environment of its own

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a bag may ask of this machine: the limits of `docs/files.md` for bags, and nothing else decides them.
 
 Neither library has such limits: `rosbags` and `mcap` decompress whatever a frame says (`storage_mcap.decompress`,

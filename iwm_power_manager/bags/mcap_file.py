@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One MCAP file being written by the `mcap` package, so that whatever happens to it, it ends with a whole record.
 
 The package's writer hands its bytes to a buffer, and from there they go into the file by unbuffered writes. So a chunk

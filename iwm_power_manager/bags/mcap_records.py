@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The records of an MCAP file one by one, damaged or not, as the MCAP 1.0 specification lays them out.
 
 What a record says is read by the `mcap` package (`mcap.records`). The way from one record to the next is our own,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages of one MCAP file, whole or damaged.
 
 A whole file's index is read by the `mcap` package. Where it is missing or makes no sense, the file is gone through

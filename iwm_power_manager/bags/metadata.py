@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What stands in a rosbag2 `metadata.yaml`, version 9, and how it is written."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read any rosbag2 bag: MCAP or sqlite3, one file or many, compressed or not, whole or damaged. Needs no ROS.
 
 Messages come in the order of their log times. What cannot be read is described in `BagReader.damage`; it is never fatal

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recording: a bounded queue, a thread that writes, and a memory of the last seconds. Needs no ROS.
 
 The thread that takes messages from DDS must never wait for a disk. It hands over batches with `put`, which never

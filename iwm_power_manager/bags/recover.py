@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make a valid bag of what a killed or starved recorder left on the disk, whoever's it was.
 
 All that can be read of a file is written anew by the `mcap` package: messages, schemas in any language, attachments,

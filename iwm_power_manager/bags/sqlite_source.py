@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages of one rosbag2 sqlite3 file: by rosbags where it is whole, row by row where it is damaged.
 
 rosbags refuses a database whose end is missing. Neither side may run what the file defines: it is opened read-only and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write a rosbag2 bag: a folder of MCAP files with `metadata.yaml`, version 9. Needs no ROS.
 
 Messages come as the CDR bytes they had on the wire and stay that. A bag is split into files by size or by duration;

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motors that do not do what they are told: commanded against reported torque, motor by motor.
 
 A report is late by up to `lag_s`, so it is held against all commands of that time: it has to lie between the least and

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The budget of changes: what a change of the share counts as, what it costs, and what it costs when little is left.
 
 A change is counted in three ways, so that no strategy can win one count at the cost of another: any change counts as

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The power manager without ROS: inputs in, one step out.
 
 Holds what lives from step to step (latest inputs, degraded state, the law's memory) and does one thing: turn them into

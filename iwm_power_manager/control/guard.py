@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The last look at a command before it leaves: independent of how it came about.
 
 The law applies every limit itself, in its stated order. This check knows nothing of that order; it only knows what no

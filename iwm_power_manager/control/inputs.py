@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Judging inputs: is this value finite, in range, not faster than physics, recent, and from a wheel that turns?
 
 Pure functions over numbers, `violation = check(value, last, limits)`, without ROS: the nodes, the replay and the tests

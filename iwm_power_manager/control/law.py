@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The control law: one step from a measurement to a command.
 
 The order, which is also the order of precedence from weak to strong:

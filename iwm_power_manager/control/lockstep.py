@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pairing the messages of one lock-step set.
 
 Each input topic has its own queue, because DDS keeps the order within a topic but not between topics. A set is complete

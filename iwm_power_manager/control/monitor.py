@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The latest accepted input of each topic, with its age and its counters.
 
 Takes readings, which are messages turned into numbers, judges them with `control.inputs`, keeps what is good and counts

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How fast the car moves, and which sensor is not believed: five speeds and the torques that were applied.
 
 The torques say what the speed does next: the road force is what turns neither motor nor brake into wheel acceleration

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How much of a change of demand will last: what the driver's noise leaves of it.
 
 The policy's Markov chain knows drives without noise. A demand that jitters, because a logged trace was rounded or a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One control step as a flat list of named numbers: what `power_manager/state` carries and a replay reads.
 
 It holds everything the law took (measurement and settings) and decided, and why. A replay that feeds the recorded

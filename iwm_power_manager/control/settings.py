@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The control law's settings: the one table of their names, defaults, ranges, units and meanings.
 
 `Settings` is that table and the NamedTuple the kernels take. ROS parameters, command-line options, replay's `--set`,

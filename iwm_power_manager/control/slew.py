@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rate limits: of a motor torque (asymmetric) and of the front share."""
 
 from __future__ import annotations

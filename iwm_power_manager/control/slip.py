@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slip of an axle, and the slip limiter of a wheel.
 
 The limiter knows, from the last command and the wheel's acceleration, which torque the road is taking from the wheel.

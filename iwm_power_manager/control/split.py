@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Power split: the strategy in use decides the front share. One entry, `decide`, for all of them.
 
 Numba can neither call through a table nor keep on disk what closes over compiled functions. So the call of each

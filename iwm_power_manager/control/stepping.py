@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When the controller steps, and how long a step counts: in real time, in lock-step, and over a recording.
 
 Three small steppers on one piece of code. The node and the replay decide nothing of this themselves.

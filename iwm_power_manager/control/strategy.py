@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a strategy is: the one interface behind which the power split is decided."""
 
 from __future__ import annotations

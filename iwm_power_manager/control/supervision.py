@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the car is asked for when inputs go missing: the degraded state, its ramps, and the way back.
 
 The rules, each one line; `docs/safety.md` argues them:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A solved policy as the control law takes it: axes, shares and the expected cost of what follows."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What inputs are believed and how the degraded state goes: one table of thresholds, each with unit, range and reason.
 
 The node has a parameter for each; a replay judges recorded inputs by `RECORDED`. Both build what the checks take from

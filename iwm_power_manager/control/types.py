@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The numbers that go into one control step and come out of it.
 
 NamedTuples of plain floats and integers: numba takes them as they are, Python code reads them by name, and nothing in

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The price of a change from a budget of changes: the multiplier of the constrained problem.
 
 The user says how many changes of the split a minute are right; what a change must be worth then follows from the car,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two checks of a solution that do not trust the solver: its Bellman residual, and driving it.
 
 T contracts by gamma, so any cost-to-go, however it was found, is within max |T J - J| / (1 - gamma) of the optimal one.

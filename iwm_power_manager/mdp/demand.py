@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver's power demand as a Markov chain (eq. 38, 39), counted from drive cycles and from recorded driving.
 
 A demand signal is sampled every decision step; each sample falls into the bin of the nearest point of the power axis

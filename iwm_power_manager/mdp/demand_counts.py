@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Driving, kept as counts: how often one power demand was followed by another, and at which speed.
 
 What `solve_policy` learns from is the demand's transition matrix (`mdp.demand`). A car that counts its transitions

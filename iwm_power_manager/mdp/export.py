@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The discretised problem as plain arrays, so that any other solver can check a policy. docs/solver.md has the form."""
 
 from __future__ import annotations

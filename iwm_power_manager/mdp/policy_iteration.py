@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 r"""Policy iteration (eq. 30, 31) that uses the problem's structure and stops on a certified bound.
 
 The Markov decision process

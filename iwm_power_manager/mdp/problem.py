@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The optimisation problem: state and control grids, and what a step costs.
 
 State x = (power demand, speed, slip of the front axle, slip of the rear axle[, previous front share]), eq. 32-37.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Spread a kernel over the cores: separate ranges of its output, each written by one thread."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cost and next state of every state and control, tabulated for the solver."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Battery of the control-oriented model: a voltage source behind a resistance (eq. 21, 22, Fig. 6).
 
 The paper prints the other root in eq. 21 (3771 A at no load) and no sign in eq. 22; here a discharging current is

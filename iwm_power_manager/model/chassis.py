@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chassis: road load (eq. 3-5) and normal forces under load transfer (eq. 7, 8)."""
 
 from __future__ import annotations

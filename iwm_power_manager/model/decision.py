@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One decision: what it costs and where it leads. The physics of the optimisation problem.
 
 `step_cost_and_next` is the one kernel that the solver tabulates and that a one-step lookahead calls at run time. It

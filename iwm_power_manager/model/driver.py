@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A driver: follows a speed trace with two pedals, and what the pedals ask for.
 
 The simulation drives with it, and the offline tool learns from it what a driver demands on a cycle. The driver looks a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether a car can follow a trace, and what following it takes: plain sums over the trace, no simulation."""
 
 from __future__ import annotations

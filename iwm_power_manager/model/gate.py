@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Skid gate (Table 2): which axles get no torque because a wheel is beyond the critical slip."""
 
 from __future__ import annotations

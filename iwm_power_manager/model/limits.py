@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Limits of the battery (eq. 24, 43), with their derating by charge and temperature."""
 
 from __future__ import annotations

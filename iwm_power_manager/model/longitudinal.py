@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Longitudinal dynamics of car and wheels (eq. 1, 2, 6-11): one implicit step.
 
 Wheel slip is stiff: at 1 m/s a wheel settles in 0.3 ms, at 30 m/s in 9 ms. The step is backward Euler: each wheel's

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """In-wheel motor: losses, electrical power (eq. 14, 15, 23), torque limits (eq. 19, 42), heat.
 
 A motor whose torque is exactly zero is idle. What that costs is the setting `idle_drive` (docs/model.md).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The numbers of a car as the kernels take them.
 
 NamedTuples are the whole interface between a vehicle file and the numerics: numba takes them as arguments, so that no

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the driver's wish means as power at the wheels, however it is said (docs/model.md, docs/connect.md).
 
     accelerator a:  P = a * P_max(v),   P_max = sum over the four motors of min(T_peak w, P_motor),  w = v / r

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Electrical power for a given road force and front share, with the slips settled.
 
 Slip settles within milliseconds, a decision about the split holds for 100 ms and more: for choosing the split, each

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From power to motor and friction torque (eq. 12, 16-20, 40-42)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the power manager says in its log: a line for each step on its way, and one for each change of its mode."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the power manager keeps of the driver's demand for the next `solve_policy`, off the control path."""
 
 from __future__ import annotations

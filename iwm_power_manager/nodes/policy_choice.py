@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which policy the node runs: the bank over friction, the fallback, and what can be said about both."""
 
 from __future__ import annotations

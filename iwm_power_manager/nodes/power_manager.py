@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node `power_manager`: between the driver's demand and four motors.
 
 A managed node. Configure loads and verifies vehicle and policy and warms the compiled law; activate starts commanding;

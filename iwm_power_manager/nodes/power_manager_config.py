@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of the power manager, and what the node builds from their values."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the power manager reports on `/diagnostics`: collects between two reports, writes one on request."""
 
 from __future__ import annotations

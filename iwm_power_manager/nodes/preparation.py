@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the power manager needs before it can drive: car, policies, controller, signals. In a thread of its own.
 
 Loading takes a moment, compiling the law much longer where the cache is empty. Meanwhile the node answers its services

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node `recorder`: writes topics to a rosbag2 MCAP bag as the bytes that came over the wire.
 
 Three threads share the work: this module's main loop takes messages from DDS (`ros.raw`), the recording writes them

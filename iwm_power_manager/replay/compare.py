@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recomputed against recorded: how far apart, since when, by stamp."""
 
 from __future__ import annotations

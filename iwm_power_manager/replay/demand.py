@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recorded drives as a source of demand for the solver."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """With what a bag is replayed: car, policies, settings of the law. From the options, else from the bag itself."""
 
 from __future__ import annotations

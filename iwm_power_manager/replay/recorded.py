@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The signals a bag has recorded: as readings in their order, and demand and speed as arrays.
 
 The solver learns the demand's Markov chain from the arrays.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run the control law over a recorded drive: no DDS, no clock; the same bag gives the same bytes every time.
 
 Where the bag holds `power_manager/state`, each step is repeated from exactly what the law took, so that an unchanged

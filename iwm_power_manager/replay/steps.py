@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From the messages of a bag to control steps: repeated exactly where the bag has them, else made from the inputs."""
 
 from __future__ import annotations

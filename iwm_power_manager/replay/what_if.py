@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What another split, or another car, would have consumed on a recorded drive: an open-loop estimate.
 
 Speed and wheel speeds stay as recorded; only the torques and their losses are computed anew. Strategies are compared at

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command line of a node, as far as a mistake in it would not be reported in one clear line by ROS itself."""
 
 from __future__ import annotations

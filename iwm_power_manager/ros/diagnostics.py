@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `/diagnostics` says: levels, messages and values from plain numbers, and the loop's supervision.
 
 The stamp is the node's clock, so that it is right under sim time; rates are per second of that clock as well.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Leaving DDS in bounded time: what a node still owes is done, and nothing its middleware does may keep it alive.
 
 A participant of Fast DDS that is destroyed while it hears of another one can wait for ever, turning in a loop that

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inputs that are fetched when they are needed, instead of waking the node one by one.
 
 An executor spends some 100 us or more on every message it dispatches; a take costs a few. A control step wants the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ctrl-C and SIGTERM in a program that has to finish what it does before it ends."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Between standard ROS messages and plain numbers, both ways, for every topic of the project.
 
 Writers return a new message, readers return plain Python numbers; nobody else touches message fields. Readers convert

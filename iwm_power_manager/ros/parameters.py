@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters declared from one table: type, default, range, unit, description, and when each may change.
 
 rclpy checks types and numeric ranges against the descriptors; what it cannot check (choices, NaN, lengths, the state of

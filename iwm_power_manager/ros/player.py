@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Play a bag to DDS, with /clock, so that the real nodes can be driven by a recorded drive.
 
 Time is the bag's: the log time, or, where a /clock was recorded, what that clock showed; so a lock-step drive, recorded

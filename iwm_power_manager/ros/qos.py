@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Quality of service of the topics.
 
 Real time follows Autoware's convention for commands and status: reliable, volatile, keep the last one; a control loop

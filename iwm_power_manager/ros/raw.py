@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Take messages from DDS as the bytes they arrived in, at the least possible cost.
 
 An rclpy executor spends some 200 us on every message (it builds a wait set over all entities each time); the take

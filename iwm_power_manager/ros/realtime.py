@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keeping other work off the control path: garbage collection, scheduling, affinity, memory.
 
 Everything here is asked of the operating system and may be refused; what was refused is returned as text, so that the

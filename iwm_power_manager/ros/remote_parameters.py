@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ask other nodes for their parameters, without waiting for any of them."""
 
 from __future__ import annotations

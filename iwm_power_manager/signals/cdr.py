@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Numbers out of CDR messages and into them, fast where messages are alike: which those of one topic are.
 
 Building a whole message to read one number of it takes most of the time of a replay, and live longer than the control

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands to bytes, by the same YAML as the signals: which topic, type and field carries the torques of the wheels.
 
     commands:

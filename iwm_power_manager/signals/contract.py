@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The interface, once: every topic with its name, type, unit, quality of service, rate, and what its loss means.
 
 Nodes, tools, bags, documentation and the tests of the running nodes take them from here. Without ROS.

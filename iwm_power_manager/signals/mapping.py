@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which topic and field is which signal, in which unit: one YAML for the live node and for bags.
 
     signals:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bytes of messages to readings, by a mapping: the same code for the live node and for bags.
 
 A topic has one reader, whatever signals it carries. What belongs together and comes apart (four wheels on four topics,

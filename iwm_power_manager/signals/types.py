@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Message types by their definitions: what stands in a bag wins, then what is installed, then ROS 2 Jazzy's own.
 
 A definition from outside is parsed and compiled by rosbags. Before that it is measured here, because rosbags unrolls

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make a drive cycle of a logged drive: `import_cycle --help`.
 
 Exit codes: 0 written; 2 bad arguments or files; 130 interrupted.

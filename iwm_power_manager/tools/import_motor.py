@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Make a motor map of a table of another program: `import_motor --help`.
 
 Exit codes: 0 written; 2 bad arguments or files; 130 interrupted.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command-line values with a range, as every command takes them."""
 
 from __future__ import annotations

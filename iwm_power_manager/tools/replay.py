@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command `replay`: the control law over a recorded drive, compared, published, or asked "what if".
 
 Exit codes: 0 done; 1 recomputed and recorded commands differ beyond the tolerance; 2 bad arguments or files;

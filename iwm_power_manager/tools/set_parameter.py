@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters and lifecycle of a running node, for whoever has no `ros2` command: list, read, set, activate."""
 
 from __future__ import annotations

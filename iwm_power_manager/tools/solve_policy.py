@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Solve power-split policies: `solve_policy --help`.
 
 Exit codes: 0 solved (or checked); 1 a policy did not reach its bound; 2 bad arguments or files; 130 interrupted.

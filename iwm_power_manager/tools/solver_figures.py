@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Picture of solved policies: the demand's transition matrix, the convergence, and the policy itself."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """See a running car: one page in the browser, served on this machine only, or lines in the terminal; from topics alone.
 
 Charts and server are Bokeh's, whose scripts come from the same server: no network is needed.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A relay between simulator and power manager that can do to the messages what broken parts do.
 
 The simulator publishes below `raw/`; the relay hands everything on, as it is or spoilt, and listens to what the power

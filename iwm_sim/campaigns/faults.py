@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`python -m iwm_sim.campaigns.faults`: break one thing after the other in a simulated drive, and see what happens.
 
 Simulator and power manager run as processes of their own, in real time, over DDS. Between them stands a relay that can

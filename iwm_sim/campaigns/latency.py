@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`python -m iwm_sim.campaigns.latency`: from inputs to command, beside a bare rclpy relay, in one run.
 
 Two processes answer: the power manager in lock-step (each set of inputs is answered at once: the whole control path,

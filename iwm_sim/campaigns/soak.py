@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`python -m iwm_sim.campaigns.soak`: half an hour in real time at 100 Hz; memory, deadlines and counts.
 
 Simulator, power manager and recorder run as in a car. Meanwhile this process samples the memory of each, and a witness

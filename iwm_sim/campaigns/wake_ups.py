@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Waking up on time, again and again, and writing down when: the loop of a witness that watches a processor.
 
 Compiled, because it shares the processor with what is watched: each wake-up of an interpreter would touch some hundred

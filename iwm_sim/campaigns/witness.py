@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A witness of what the machine did to a process: how long it stood still, and how long it let the process wait.
 
 A deadline can be missed because the program took too long, or because it was not run: the operating system gave the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Why the paper's program loses: what each of its choices costs, changed alone and all together.
 
 The base is `paper_sdp`. Each change is one setting of its grid, or how the policy is used; the problem is

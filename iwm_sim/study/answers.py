@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a study says, in sentences made from its numbers: does the paper hold, what does better, where nothing helps."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's parameter estimation (eq. 25): the control model's battery, fitted to the plant's state of charge.
 
 The plant drives FTP-75 and HWFET with equal split; its electrical power goes through the static circuit of the control

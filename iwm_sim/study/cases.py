@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a case is: one drive of one car over one cycle on one road with one strategy.
 
 A case holds file names and plain numbers only, so that it travels to a worker process as it is. Everything it needs is

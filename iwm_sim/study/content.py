@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A study's numbers, typed: what `study.json` holds, and all that its tables need."""
 
 from __future__ import annotations

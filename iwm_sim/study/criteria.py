@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a policy has to reach, checked on the rows of a study: criterion, value, met or not.
 
 Nothing here decides what the numbers are; a criterion that is not met is printed like any other.

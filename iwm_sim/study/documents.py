@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Numbers in documents: what stands between two markers of a Markdown page is made, not typed.
 
 `<!-- study: NAME -->` ... `<!-- end -->` is filled from the stored study by the function of that name in `BLOCKS`;

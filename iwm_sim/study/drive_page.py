@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page of one drive: result beside a reference, everything over time, settings."""
 
 from __future__ import annotations

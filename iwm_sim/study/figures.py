@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Builders of the paper's figures: arrays in, a matplotlib figure out.
 
 Nothing here computes a result or touches a file. A figure suits the page (`report.Pictures`) and print alike. The style

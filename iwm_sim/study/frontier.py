@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The frontier: what a strategy saves, against how often it changes the split to do so.
 
 A saving alone says little: changing at every glimpse of a gain saves more than a strategy that a driver would want.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of frontiers: saving against changes, and the margins of many cells."""
 
 from __future__ import annotations

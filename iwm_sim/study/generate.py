@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Drives and cars that nobody chose: drawn from a seed, to judge a strategy on what it was not made for.
 
 Everything here is a pure function of its seed (NumPy's PCG64, whose streams do not change). Seeds below

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the study's tables call the strategies."""
 
 from __future__ import annotations

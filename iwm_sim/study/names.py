@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Names and numbers that the command line needs before anything is driven."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The study as one HTML page, as Markdown and as pictures: answers first, then the tables with their figures."""
 
 from __future__ import annotations

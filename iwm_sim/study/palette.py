@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Colours of every picture of the project: the Okabe-Ito set, told apart with any kind of colour vision.
 
 The page (`assets/report.css`) knows the same colours as --c0 .. --c7, with lighter ones for a dark background; SVG

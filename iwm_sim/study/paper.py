@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the paper prints, and what follows from its numbers alone."""
 
 from __future__ import annotations

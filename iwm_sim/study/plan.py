@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a study drives: the cells of the paper's tables, the rivals, the frontier, the robustness and the stops."""
 
 from __future__ import annotations

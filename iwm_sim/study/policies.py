@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which policy a case drives with: one of a folder that fits car and road, or one solved now and kept for next time."""
 
 from __future__ import annotations

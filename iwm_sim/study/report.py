@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One self-contained HTML page: tables, charts over time, figures and settings of a run.
 
 A page is a list of blocks, each a small frozen dataclass; `assets/report.html.jinja` knows how each looks, and escapes

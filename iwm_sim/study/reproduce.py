@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All tables and figures of the paper, and what beats them: drives everything and gathers the numbers.
 
 The result is a `Study` (stored as `study.json`), from which `pages` makes tables, and a few series for the figures.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What results amount to beside each other: a typed row for each, with its saving against equal split."""
 
 from __future__ import annotations

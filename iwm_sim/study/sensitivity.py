@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's sensitivity analysis (Fig. 8 to 10): depletion of one step over the front axle's power.
 
 Speed, demand and the slips of both axles are given; each axle's motors turn at the speed the slip says and give the

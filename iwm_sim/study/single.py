@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One table or one figure of the study, without the rest of it."""
 
 from __future__ import annotations

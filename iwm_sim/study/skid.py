@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Emergency stops: how far the car slides under each kind of skid avoidance, beside the best that friction allows."""
 
 from __future__ import annotations

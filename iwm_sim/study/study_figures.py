@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The figures of a study, with what they need beyond its numbers."""
 
 from __future__ import annotations

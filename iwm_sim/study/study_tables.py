@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tables of a study, from its numbers alone: a stored study gives the same tables again."""
 
 from __future__ import annotations

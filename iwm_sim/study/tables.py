@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rows as tables: on the terminal and in Markdown. The page has its own (`report.Table`); the columns are the same."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frontiers of drives and cars that nobody chose: what our strategy is worth there, said with its worst cells.
 
 One setting for all: the default budget, the default grid, policies solved from the same three cycles as the shipped

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's strategy under names of its own: a strategy with the grid, the decision period and the gate it is for."""
 
 from __future__ import annotations

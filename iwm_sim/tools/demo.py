@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`demo`: a whole drive over DDS in one command.
 
 Recorder, power manager and simulator run as three processes on a DDS domain of their own, on this machine only. In

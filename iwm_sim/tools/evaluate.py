@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Drive strategies over cycles and compare them: `evaluate --help`.
 
 Exit codes: 0 done; 2 bad arguments or files; 130 interrupted.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `evaluate` does with its options; imported when they are known, so that `--help` needs none of it."""
 
 from __future__ import annotations

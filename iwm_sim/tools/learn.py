@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Learn a policy from recorded driving, and keep it only if it is no worse: `learn_policy --help`.
 
 Exit codes: 0 done; 2 bad arguments or files; 130 interrupted.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compile every kernel that the programs call, once, so that they start warm: the last step of an installation."""
 
 from __future__ import annotations

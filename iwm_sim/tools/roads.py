@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Drive the scenarios of real roads and say what came out: `roads --help`.
 
 Exit codes: 0 every requirement is met; 1 one is not; 2 bad arguments or files; 130 interrupted.

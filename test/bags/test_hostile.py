@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags from strangers: nothing runs, hangs, fills memory or the disk, or leads out of the bag; one line says why."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What Foxglove and PlotJuggler demand: decodable schemas, stamps, and layouts that name what is recorded."""
 
 from __future__ import annotations

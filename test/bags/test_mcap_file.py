@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The MCAP files against the independent reader of the `mcap` package."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A power cut: kill -9 leaves the kernel to finish the job, a power cut leaves what the disk had been told to keep."""
 
 from __future__ import annotations

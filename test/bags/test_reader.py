@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reading what this project, rosbags and mcap have written, whole or damaged."""
 
 from __future__ import annotations

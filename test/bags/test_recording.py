@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The recording thread: nothing lost without being counted, whatever the disk does."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recovery: from a cut at any byte, from any damaged byte, from kill -9 at any moment."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recovery of other recorders' bags: everything that was readable is there afterwards, as it was."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bags against the independent readers rosbags and mcap, and against rclpy's own type hashes."""
 
 from __future__ import annotations

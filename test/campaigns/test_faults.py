@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The fault campaign's own parts: each fault does to a message what its name says, and a row tells the truth."""
 
 from __future__ import annotations

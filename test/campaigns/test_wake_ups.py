@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The witness's compiled loop: when it wakes, what it writes down, and that nothing of it is lost."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the machine did: stalls of a processor, and waits of a process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motors held against their commands: what is found, how soon, and what is never called a fault."""
 
 from __future__ import annotations

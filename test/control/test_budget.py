@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The budget of changes: what counts, what it costs, and that nothing gets past the bucket."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The power manager without ROS: whatever comes in, what goes out is finite, limited, slew-limited and explained."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The last look at a command: every bound is seen when it is crossed, and only then."""
 
 from __future__ import annotations

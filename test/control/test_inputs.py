@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Input checks: what is believed, what is not, and what a lost wheel is replaced by."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The control law: what no input may make it do, what it owes to every demand, and every step against plain Python."""
 
 from __future__ import annotations

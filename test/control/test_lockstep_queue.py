@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sets of lock-step messages are paired, whatever the order in which topics arrive."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The latest good input of each topic: what is kept, dropped, counted, and how old it is."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The motion estimate: which sensor is believed, on roads whose every force is known."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Noise of the demand is told from what lasts, and only where there is some."""
 
 from __future__ import annotations

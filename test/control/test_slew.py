@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rate limits against plain Python that walks from where the torque is to where it should be."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slip of an axle, its filter, the road's torque and the limiter's room, against plain Python and by hand."""
 
 from __future__ import annotations

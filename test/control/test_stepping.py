@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When the controller steps and how long a step counts, with a controller that only writes down what it is asked."""
 
 from __future__ import annotations

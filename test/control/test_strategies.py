@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each strategy against plain Python that tries every share."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The degraded state: what fades, how fast, and how torque comes back."""
 
 from __future__ import annotations

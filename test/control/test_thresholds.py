@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The table of thresholds: what the checks take comes from it, for the node and for a replay alike."""
 
 from __future__ import annotations

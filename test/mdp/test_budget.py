@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The price of a change that keeps a budget, against the chain simulated state by state."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The certificates themselves: they accept what is right and notice what is not."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demand's Markov chain: power of a cycle, counting, rows without data, mixing."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Counted transitions: what was driven is what is counted, kept, and given to the solver."""
 
 from __future__ import annotations

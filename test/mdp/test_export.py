@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The exported problem is the solved one: another solver finds the same optimum in it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The structure-aware solver against two that know nothing of the structure, and its bound against the truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Problem files: the two presets, and everything that can be wrong with a user's own."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The step kernel against plain Python, its limits, and the tables made from it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The control model's battery against the circuit it stands for."""
 
 from __future__ import annotations

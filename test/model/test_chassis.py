@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Road load and load transfer against the balance of forces and moments."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver against plain Python, and whether it drives well."""
 
 from __future__ import annotations

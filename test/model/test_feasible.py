@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a car cannot follow is said; what it can is not."""
 
 from __future__ import annotations

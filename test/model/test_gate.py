@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The skid gate: Table 2, its hysteresis, and whose power goes where."""
 
 from __future__ import annotations

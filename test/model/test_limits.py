@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Battery limits: derating by charge and temperature, and the part of the torques that fits in."""
 
 from __future__ import annotations

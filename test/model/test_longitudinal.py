@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The implicit step: it solves the equations, agrees with SciPy, and is right where the answer is known."""
 
 from __future__ import annotations

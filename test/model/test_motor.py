@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The motor: the check points of its fit, idle drives, maps, limits and heat."""
 
 from __future__ import annotations

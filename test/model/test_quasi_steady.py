@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Power of a split with settled slips, against plain Python that finds each slip by root search."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From power to torque: the speed to divide by, what goes to the other axle, and who brakes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The control law in plain Python, wheel by wheel, as the rules are stated and not as the kernel computes them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The solver's problem the slow way: every transition probability written into one dense matrix."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver in plain Python: what force is wanted, which pedal gives it, what the integral does."""
 
 from __future__ import annotations

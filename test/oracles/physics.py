@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tyre, chassis, motor limits and battery in plain Python, each from its definition rather than from the kernel."""
 
 from __future__ import annotations

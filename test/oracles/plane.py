@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion in the plane written down from its equations, integrated by SciPy: no wheel stands, nothing holds."""
 
 from __future__ import annotations

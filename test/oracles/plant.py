@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated battery and the energy balance of a car, from their equations."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Strategies in plain Python: every share tried, the cheapest taken."""
 
 from __future__ import annotations

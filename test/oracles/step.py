@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One decision step in plain Python: the equations of eq. 1-23 in one system, solved by SciPy."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """docs/architecture.md lists the modules that are there, with what they say of themselves."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Numbers in documents are made by a command: what stands between markers is what the study says, and none is typed."""
 
 from __future__ import annotations

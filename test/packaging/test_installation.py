@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """colcon and pip put every executable where its users look for it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The launch files say what their arguments are, and give nodes only parameters that they have.
 
 Launch itself is not among the wheels this is tested with: stand-ins note what the files make of it.

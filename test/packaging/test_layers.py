@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What is imported when: the law without solver and files, `--help` without compiler, pictures and science."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """package.xml, setup.py and the sources say the same thing about the package."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The tutorials are notebooks, and every cell runs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Replay of other cars' and other recorders' bags: the right steps, or one line that says why not."""
 
 from __future__ import annotations

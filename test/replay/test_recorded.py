@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Demand and speed of recorded drives as arrays."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Replay: bit by bit where nothing has changed, and never silent where something has."""
 
 from __future__ import annotations

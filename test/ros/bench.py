@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A power manager in a process of its own, and a hand on each of its topics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Nodes over real DDS: every test run has a domain of its own, every test a namespace."""
 
 from __future__ import annotations

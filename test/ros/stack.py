@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Another vehicle stack: whatever topics and types it has, beside a power manager that is told of them by YAML."""
 
 from __future__ import annotations

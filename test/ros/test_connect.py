@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cars of other stacks, connected by YAML alone: what they send, what they obey, over DDS between processes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo as a user runs it: three processes over DDS on a piece of NYCC, and everything they leave."""
 
 from __future__ import annotations

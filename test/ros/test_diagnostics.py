@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What diagnostics say, from plain numbers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Leaving DDS: a process that has done its work ends, in time and with its exit code."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The examples drive: another DDS without ROS, and whatever else a folder in examples/ promises."""
 
 from __future__ import annotations

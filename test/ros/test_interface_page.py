@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """docs/interface.md, docs/interface.json and config/security/ say what the sources say, and what running nodes show."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Numbers survive the journey through a standard message and back."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters: what is refused, with which words, and what documentation says about them."""
 
 from __future__ import annotations

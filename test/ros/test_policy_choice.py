@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which policy runs: the bank by friction, what is refused, and the fallback."""
 
 from __future__ import annotations

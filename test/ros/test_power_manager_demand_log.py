@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The power manager counts the driver's demand for the next policy, over DDS."""
 
 from __future__ import annotations

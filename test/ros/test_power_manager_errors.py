@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Errors nobody expects lead to a defined state: zero torque, and the node says why."""
 
 from __future__ import annotations

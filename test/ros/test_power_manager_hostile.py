@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A policy or a vehicle from a stranger: refused, and the node says why."""
 
 from __future__ import annotations

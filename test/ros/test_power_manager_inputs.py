@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The running node and its inputs over DDS: bad ones are dropped and counted, missing ones degrade, all recovers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each transition of the managed node, asked for with the real services over DDS."""
 
 from __future__ import annotations

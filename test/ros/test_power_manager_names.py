@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the node says, what it is called, and what it lets others change: seen from outside, over DDS."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Control steps come when they are due, ahead of the executor, and never keep it from serving the rest."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How the node starts alone: parameter file, namespace, remaps; one clear line and an exit code when it cannot."""
 
 from __future__ import annotations

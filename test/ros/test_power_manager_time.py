@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lock-step and simulated time: every set answered once, the same bits as without ROS, and a clock that misbehaves."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keeping other work off the control path."""
 
 from __future__ import annotations

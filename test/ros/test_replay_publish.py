@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recorded drive, played to the real node, gives what the offline replay gives; and what the node does, replays."""
 
 from __future__ import annotations

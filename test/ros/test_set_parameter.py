@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reading and setting a running node's parameters, and moving it through its lifecycle, without `ros2`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulator as a process of its own, with a stand-in for the power manager in this one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The Fast DDS profile of docs/safety.md, duty 7: a node that shares no memory still hears nodes that do."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Numbers out of CDR and into it against the generated decoders of rosbags, over types of every shape."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Torques to bytes: every shape a command may have, and one clear line for one it cannot have."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mapping files: units, names, and one clear line for every mistake."""
 
 from __future__ import annotations

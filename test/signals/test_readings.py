@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Readings from bytes are those of the decoded message, whatever came before and however the signals are spread."""
 
 from __future__ import annotations

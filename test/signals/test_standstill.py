@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What each way to say a demand means to a car at rest, through the law: docs/connect.md promises it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Message types by their definitions: the bag's own wins, whatever it is written in, and none can run or hang."""
 
 from __future__ import annotations

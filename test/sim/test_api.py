@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The package from Python, as the documentation shows it."""
 
 import re

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Driver, law and plant together: books, determinism, convergence, and the same bits from Python."""
 
 from __future__ import annotations

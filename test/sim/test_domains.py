@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """No two runs get the same DDS domain."""
 
 from __future__ import annotations

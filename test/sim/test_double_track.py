@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion in the plane: against SciPy, against closed forms, at rest, and against the straight line it contains."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The double track beside models that others wrote: CommonRoad's single track, with linear tyres and with Pacejka's.
 
 Both describe a car by its wheelbase, mass, yaw inertia and tyres. Where they hold, at lateral accelerations that move

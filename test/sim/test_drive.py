@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The drive cut open at the control law: the closed loop's numbers, bit for bit, and a run's file."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What fails in a drive: each kind of fault, its time, and several at once."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What a run amounts to, on series made by hand."""
 
 from __future__ import annotations

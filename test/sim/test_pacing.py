@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """When the simulator steps: answers by stamp, repetitions, giving up; and steps due on a clock."""
 
 import pytest

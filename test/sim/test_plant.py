@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated car: its battery, motors and brakes against closed forms, its motion against SciPy, its books."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Preview: the cheapest path against every path, the schedule against the table it is read from, the rule's lines."""
 
 from __future__ import annotations

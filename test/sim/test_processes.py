@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Children that are started, watched and stopped together; real processes, none of them ours to keep."""
 
 import os

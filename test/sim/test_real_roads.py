@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scenarios of real roads that have to hold: each meets all that its file requires."""
 
 from __future__ import annotations

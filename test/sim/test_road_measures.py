@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measures of a drive, each on a run made by hand that has it in plain sight."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenarios driven with the power manager: roads, faults, messages and bounds do what the file says."""
 
 from __future__ import annotations

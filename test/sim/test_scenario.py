@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenario files: what a good one becomes, and the one line that a bad one gets."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The driver who keeps the lane: straight, after a jolt, beside a lasting push, and never faster than hands."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The battery's estimation: what the static circuit says, and that the fit finds it."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cases: driven alike wherever, compared only where comparing makes sense."""
 
 import dataclasses

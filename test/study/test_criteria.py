@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Criteria: met and not met, and what counts where."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Many cases at once: in order, longest first, and an error of one ends all."""
 
 import dataclasses

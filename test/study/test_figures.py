@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The figure builders: what is drawn is what was given, with units on every axis and the style left as it was."""
 
 import matplotlib as mpl

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Frontiers: margins, bounds and verdicts from points, and one small drive."""
 
 from __future__ import annotations

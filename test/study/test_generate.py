@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Generated cycles, cars and noise: the same from the same seed, and sane whatever the seed."""
 
 from __future__ import annotations

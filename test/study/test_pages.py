@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The study's pages: from the stored numbers alone, and what docs/study.md shows is what they say."""
 
 from pathlib import Path

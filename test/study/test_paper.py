@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the paper prints, and what follows from it alone (docs/model.md, errors in the paper)."""
 
 import pytest

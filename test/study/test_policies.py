@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which policy drives: the one that fits, or one that is solved now, or a clear refusal."""
 
 import shutil

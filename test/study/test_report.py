@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page: what it holds, what it must never hold, and that a browser shows it without a complaint."""
 
 import html.parser

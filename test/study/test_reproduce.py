@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The study as a whole, on a short cycle."""
 
 import shutil

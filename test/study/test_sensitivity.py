@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Depletion over the split: symmetric where it must be, and nothing where a motor cannot."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Emergency stops, and the best a road allows."""
 
 import numpy as np

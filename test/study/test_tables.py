@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rows as text and Markdown."""
 
 from dataclasses import replace

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The demo without processes: its command line, what it starts nodes with, comparisons and the table."""
 
 import json

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """import_cycle: logs in any unit, with gaps and noise, become a cycle; what was guessed is said."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """import_motor: tables in rpm, percent, matrix layout, with decimal commas and behind a gear become a map."""
 
 from __future__ import annotations

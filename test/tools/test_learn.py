@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`learn_policy`: what is recorded is tried at several weights, and only what drives no worse is kept."""
 
 from __future__ import annotations

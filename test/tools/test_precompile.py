@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """After `precompile`, every program finds what it calls compiled."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command `roads`: its lines, its page, its JSON and its exit codes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Learning from recorded driving, on real bags: what was driven is what is learned, and it is worth learning."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`solve_policy` as a user calls it: files in, policies out, one line and a code for every mistake."""
 
 from __future__ import annotations

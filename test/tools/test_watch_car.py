@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The page of a running car: what the topics said stands in it, in a real browser where there is one."""
 
 from __future__ import annotations

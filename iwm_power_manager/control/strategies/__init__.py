@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The strategies, one file each: how much of the demand the front axle gets.
 
 Every module here states one `STRATEGY`; this table finds them all. To add one, add a file (and its test): nothing else

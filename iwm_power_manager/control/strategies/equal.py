@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`equal`: half to each axle (the paper's ED)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`instantaneous`: the split of least battery power now, blind to slip."""
 
 from __future__ import annotations

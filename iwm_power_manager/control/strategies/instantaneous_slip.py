@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`instantaneous_slip`: the split of least battery power for the same road force, with load transfer and settled slips.
 
 It changes only if that saves enough.

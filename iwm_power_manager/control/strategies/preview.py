@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`preview`: plays a schedule made with the whole cycle known; the bound for all others."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`rule`: a straight line P_f(P_dem) fitted to a dynamic program (the paper's GRDP)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`sdp`: the share of the solved policy, looked up in its table."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`sdp_lookahead`: one step of Bellman's equation at the continuous state, with the solved cost-to-go.
 
 It minimises the cost of the next step plus the expected cost of all that follows: no rounding to grid points. A change

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tyre: slip (eq. 10), and friction over slip by the model that the vehicle file names.
 
 Each model is a module of its own that alone knows its parameters; here they are told apart by a number, at run time, so

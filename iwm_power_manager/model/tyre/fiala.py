@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fiala's brush tyre: bristles that stick and then slide, with a sliding friction that may be below the peak.
 
 At a slip s, with the stiffness C (friction coefficient per slip of the adhering tyre, its whole contact patch) and the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Magic Formula (eq. 9): a sine that rises, peaks and falls a little. Its keys in a vehicle file stand here only."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slip of a wheel (eq. 10).
 
 Eq. 10 gives the slip for driving and for braking with different denominators. The case is chosen by the sign of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fiala's tyre against the bristles it is made of, its inverse, and a car on it."""
 
 from __future__ import annotations

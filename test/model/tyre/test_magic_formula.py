@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slip and Magic Formula against their definitions, and each inverse against its direct form."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each tyre model's parameters stand in its own module and in no other."""
 
 from __future__ import annotations
