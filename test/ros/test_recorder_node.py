@@ -217,6 +217,7 @@ def test_latched_and_best_effort_publishers_are_met_with_their_own_qos(
     )
     process = recorder(tmp_path / "bag", "regex:=/(latched|best_effort)", "wait_for:=[/latched,/best_effort]")
     peer.until_ready()
+    peer.until(lambda: best_effort.get_subscription_count() == 1, "match seen by the publisher")
     best_effort.publish(Float64(data=2.0))
     # A volatile, best-effort newcomer cannot meet what was asked of the first: the recorder asks for less.
     newcomer = peer.node.create_publisher(
