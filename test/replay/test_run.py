@@ -516,3 +516,14 @@ def test_progress_is_called_with_messages_and_time(drive: Path) -> None:
             module._PROGRESS_EVERY = every
     assert [messages for messages, _ in seen] == list(range(100, COUNT * 7 + 1, 100))
     assert [time for _, time in seen] == sorted(time for _, time in seen)
+
+
+@pytest.mark.parametrize(("recorded", "differing"), [(("old",), 0), (("old", "new"), 1)])
+def test_a_younger_signal_is_compared_where_the_record_has_it(recorded, differing):
+    comparer = TopicComparer("/t", 0.5, {"new"})
+    comparer.recorded(0, 0, recorded, (1.0, 7.0)[: len(recorded)])
+    comparer.recomputed(0, 0, ("old", "new"), (1.0, 9.0))
+    assert comparer.result().differing == differing
+    comparer.recorded(1, 0, (), ())
+    comparer.recomputed(1, 0, ("old",), (1.0,))
+    assert comparer.result().differing == differing + 1
