@@ -87,6 +87,43 @@ def check_value(value: float, last: float, elapsed_s: float, limits: ValueLimits
     return Violation.NONE
 
 
+class Rival(NamedTuple):
+    """Messages that were refused but agree among themselves, as those of a second publisher of the topic do.
+
+    Attributes
+    ----------
+    value : last one
+    since_ns, last_ns : stamps of the first and the last
+    """
+
+    value: float
+    since_ns: int
+    last_ns: int
+
+    @property
+    def lasted_s(self) -> float:
+        """For how long they have agreed."""
+        return (self.last_ns - self.since_ns) / _NS_PER_S
+
+
+def follow_rival(rival: Rival | None, value: float, stamp_ns: int, limits: ValueLimits, gap_s: float) -> Rival:
+    """The rival with one more message that was refused; a new one if that does not follow from those before.
+
+    Parameters
+    ----------
+    rival : so far; None: there is none
+    value : possible by itself
+    stamp_ns : of the message
+    limits : range and rates
+    gap_s : longest time between two messages of a rival
+    """
+    if rival is not None:
+        elapsed_s = (stamp_ns - rival.last_ns) / _NS_PER_S
+        if 0.0 < elapsed_s <= gap_s and check_value(value, rival.value, elapsed_s, limits) is Violation.NONE:
+            return Rival(value, rival.since_ns, stamp_ns)
+    return Rival(value, stamp_ns, stamp_ns)
+
+
 def check_stamp(stamp_ns: int, last_ns: int | None, now_ns: int, limits: StampLimits) -> Violation:
     """Judge the stamp of a message against the clock and against the last accepted stamp of its topic."""
     ahead_s = (stamp_ns - now_ns) / _NS_PER_S

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from iwm_power_manager.control.inputs import (
     NEW_WHEELS,
+    Rival,
     StampLimits,
     ValueLimits,
     Violation,
@@ -23,6 +24,7 @@ from iwm_power_manager.control.inputs import (
     check_names,
     check_stamp,
     check_value,
+    follow_rival,
     judge_wheels,
 )
 from iwm_power_manager.control.types import Wheels
@@ -34,6 +36,10 @@ BATTERY = "battery_state"
 FRICTION = "road_friction"
 
 _NS_PER_S = 1e9
+#: Refused for what was accepted before, not for what they are.
+_REFUSED_BY_ANOTHER = (Violation.TOO_FAST, Violation.STAMP_NOT_NEWER)
+#: The battery comes a tenth as often as the other inputs.
+_SLOW = 10.0
 
 
 class SpeedReading(NamedTuple):
@@ -89,6 +95,7 @@ class InputLimits(NamedTuple):
     demand_delay_s : longest time between sending and receiving a power demand, which carries no stamp
     speed, demand, soc, temperature, friction : range and rates
     wheels : see `WheelLimits`
+    rival_s : time after which messages that agree among themselves are believed against those that were accepted
     radius_m : rolling radius
     """
 
@@ -100,6 +107,7 @@ class InputLimits(NamedTuple):
     temperature: ValueLimits
     friction: ValueLimits
     wheels: WheelLimits
+    rival_s: float
     radius_m: float
 
 
@@ -172,6 +180,7 @@ class InputMonitor:
     def forget_times(self) -> None:
         """Keep the values, but not how old they are: after the clock was set back. All inputs count as missing."""
         self._wheels_ns: int | None = None
+        self._rivals: dict[str, Rival] = {}
         for tally in self.tallies.values():
             tally.accepted_ns = None
 
@@ -197,6 +206,12 @@ class InputMonitor:
         if violation is Violation.NONE:
             last = math.nan if tally.accepted_ns is None else self.speed_mps
             violation = check_value(reading.speed_mps, last, tally.age_s(reading.stamp_ns), self._limits.speed)
+        if violation in _REFUSED_BY_ANOTHER and self._outlasts(
+            SPEED, reading.stamp_ns, reading.speed_mps, self._limits.speed, self._limits.rival_s
+        ):
+            told = self._told_by_wheels(reading.stamp_ns)
+            farther = abs(reading.speed_mps - told) >= abs(self.speed_mps - told)  # never so where nobody tells
+            violation = violation if farther else self._believe_rival(SPEED)
         if tally.note(violation, reading.stamp_ns):
             self.speed_mps = reading.speed_mps
             return True
@@ -267,6 +282,10 @@ class InputMonitor:
             violation = check_value(reading.soc, math.nan if first else self.soc, elapsed_s, self._limits.soc)
         if violation is Violation.NONE and not math.isnan(reading.temperature_c):
             violation = check_value(reading.temperature_c, self.temperature_c, elapsed_s, self._limits.temperature)
+        if violation in _REFUSED_BY_ANOTHER and self._outlasts(
+            BATTERY, reading.stamp_ns, reading.soc, self._limits.soc, _SLOW * self._limits.rival_s
+        ):
+            violation = self._believe_rival(BATTERY)
         if tally.note(violation, reading.stamp_ns):
             self.soc = reading.soc
             self.temperature_c = reading.temperature_c
@@ -280,6 +299,30 @@ class InputMonitor:
             self.friction = friction
             return True
         return False
+
+    def _outlasts(self, topic: str, stamp_ns: int, value: float, limits: ValueLimits, rival_s: float) -> bool:
+        """Whether a refused message is of a second source that has agreed with itself for long, beside a live first.
+
+        What was accepted last must not be believed for ever: whoever drew it away would have the topic for himself.
+        """
+        if check_value(value, math.nan, 0.0, limits) is not Violation.NONE:
+            return False
+        rival = self._rivals[topic] = follow_rival(self._rivals.get(topic), value, stamp_ns, limits, rival_s)
+        accepted_ns = self.tallies[topic].accepted_ns
+        alive = accepted_ns is not None and abs(stamp_ns - accepted_ns) <= rival_s * _NS_PER_S
+        return alive and rival.lasted_s >= rival_s
+
+    def _believe_rival(self, topic: str) -> Violation:
+        """From now on the others are the rival."""
+        del self._rivals[topic]
+        return Violation.NONE
+
+    def _told_by_wheels(self, stamp_ns: int) -> float:
+        """Speed of the car by its two middle wheels; NaN if they have not come of late."""
+        if self.tallies[WHEELS].age_s(stamp_ns) > self._limits.rival_s:
+            return math.nan
+        slow, fast = sorted(self.wheel_speed_radps)[1:3]
+        return 0.5 * (slow + fast) * self._limits.radius_m
 
     def _check_stamp(self, tally: Tally, stamp_ns: int, now_ns: int) -> Violation:
         if self._limits.stamp is None:

@@ -88,6 +88,17 @@ class Thresholds(NamedTuple):
         float,
         _threshold("a lost wheel has to be good for this long before it is used again", "s", 0.0, 60.0),
     ] = 0.5
+    # Longer than any burst of bad values, shorter than what a driver notices.
+    rival_s: Annotated[
+        float,
+        _threshold(
+            "two sources of an input: the refused one is believed after this (battery: ten times), a speed only "
+            "if it is nearer to the wheels",
+            "s",
+            0.05,
+            60.0,
+        ),
+    ] = 0.3
     # A torque is reckoned from currents: to a tenth or so at best.
     motor_tolerance_nm: Annotated[
         float, _threshold("difference of reported and commanded motor torque that is always believed", "N m", 0.1, 1e3)
@@ -260,5 +271,6 @@ def input_limits(thresholds: Thresholds, radius_m: float, by_clock: bool) -> Inp
             stray_radps=t.wheel_stray_radps,
             distrust_s=t.wheel_distrust_s,
         ),
+        rival_s=t.rival_s,
         radius_m=radius_m,
     )

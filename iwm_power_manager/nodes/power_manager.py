@@ -314,7 +314,11 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         for topic, reader in self._readers.items():
             kind = messages.message_class(reader.read.types.name)
             reliability = "reliable" if "reliable" in {source.qos for source in reader.sources} else "best_effort"
-            asked = profile if self._lockstep else qos.profile(lockstep=False, reliability=reliability)
+            asked = (
+                profile
+                if self._lockstep
+                else qos.profile(lockstep=False, depth=qos.INPUT_DEPTH, reliability=reliability)
+            )
             if self._lockstep and set(reader.signals).intersection((*DEMANDS, *PEDALS)):
                 self._demand_reader = reader
                 self._demand_subscription = self.create_subscription(
@@ -500,12 +504,19 @@ class PowerManager(KeepsItsValues, LifecycleNode):
             *self._commands[FRICTION](stamp_ns, command.friction_torque_nm),
             (NODE_STATE, self._write_state(stamp_ns, numbers)),
         ]
-        if isinstance(self._stepper, RealTime) and not self._stepper.may_send(time.monotonic()):
+        if not self._publish_in_time(self._answer):
             return
-        self._publish(self._answer)
         if self._demand_log:
             self._demand_log.note(taken.stamp_ns, numbers)
         self._report.note_step(command, taken.since_s, time.perf_counter() - started_s)
+
+    def _publish_in_time(self, answer: list[tuple[str, bytes]]) -> bool:
+        """Publish what came of a step; each message only if the process was not held up before it."""
+        for topic, data in answer:
+            if isinstance(self._stepper, RealTime) and not self._stepper.may_send(time.monotonic()):
+                return False
+            self._publishers_made[topic].publish(data)
+        return True
 
     def _publish(self, answer: list[tuple[str, bytes]]) -> None:
         for topic, data in answer:
@@ -638,7 +649,8 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         values = {f"{topic}: publishers": str(count) for topic, count in counts.items()}
         level = diagnostics.ERROR if problems else diagnostics.OK
         statuses = [diagnostics.Status("command topics", level, "; ".join(problems) or "ok", values)]
-        subscriptions = self._intake.subscriptions()
+        of_demand = [self._demand_subscription] if self._demand_subscription else []  # in lock-step
+        subscriptions = [*self._intake.subscriptions(), *of_demand]
         mismatches = mismatched_publishers(self, subscriptions, self._msgtypes)
         unheard = [f"{topic}: {why}" for topic, why in mismatches.items()]
         senders = {found.topic_name: self.count_publishers(found.topic_name) for found in subscriptions}
@@ -647,7 +659,7 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         if unheard or several:
             level = diagnostics.ERROR if unheard else diagnostics.WARN
             statuses.append(diagnostics.Status("input topics", level, "; ".join([*unheard, *several]), {}))
-        self._says.problems([*problems, *unheard])
+        self._says.problems([*problems, *unheard, *several])
         return statuses
 
 

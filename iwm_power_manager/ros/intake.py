@@ -3,7 +3,7 @@
 
 An executor spends some 100 us or more on every message it dispatches; a take costs a few. A control step wants the
 newest message of every topic at one moment, so it takes them then. A publisher that floods a topic cannot starve the
-loop either: of a queue of one, whatever comes between two steps overwrites itself.
+loop either: of a short queue, whatever comes between two steps overwrites itself.
 """
 
 from __future__ import annotations

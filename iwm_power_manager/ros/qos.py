@@ -14,6 +14,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProf
 
 REAL_TIME_DEPTH = 1
 LOCKSTEP_DEPTH = 100
+#: Of an input: a second publisher as fast as the car's must not push the car's own messages out.
+INPUT_DEPTH = 4
 
 RELIABILITIES = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control.inputs import (
     NEW_WHEELS,
+    Rival,
     StampLimits,
     ValueLimits,
     Violation,
@@ -20,6 +21,7 @@ from iwm_power_manager.control.inputs import (
     check_names,
     check_stamp,
     check_value,
+    follow_rival,
     judge_wheels,
 )
 
@@ -33,6 +35,28 @@ SECOND_NS = 1_000_000_000
 def test_every_reason_has_a_code_of_its_own() -> None:
     assert [violation.value for violation in Violation] == list(range(12))
     assert [verdict.value for verdict in WheelVerdict] == list(range(8))
+
+
+class TestRival:
+    LIMITS = ValueLimits(-1.0, 60.0, 10.0, 20.0, 0.0)
+
+    def follow(self, value: float, after_s: float) -> Rival:
+        return follow_rival(Rival(5.0, 0, SECOND_NS), value, SECOND_NS + int(after_s * 1e9), self.LIMITS, 0.25)
+
+    def test_the_first_message_begins_it(self) -> None:
+        found = follow_rival(None, 3.0, 7, self.LIMITS, 0.25)
+        assert found == Rival(3.0, 7, 7)
+        assert found.lasted_s == 0.0
+
+    @pytest.mark.parametrize(("value", "after_s"), [(5.0, 0.001), (7.5, 0.25), (0.0, 0.25)])
+    def test_a_message_that_follows_goes_on_with_it(self, value: float, after_s: float) -> None:
+        found = self.follow(value, after_s)
+        assert found == Rival(value, 0, SECOND_NS + int(after_s * 1e9))
+        assert found.lasted_s == pytest.approx(1.0 + after_s)
+
+    @pytest.mark.parametrize(("value", "after_s"), [(5.0, 0.0), (5.0, -0.1), (5.0, 0.251), (7.51, 0.25), (-0.1, 0.25)])
+    def test_one_that_does_not_begins_another(self, value: float, after_s: float) -> None:
+        assert self.follow(value, after_s).lasted_s == 0.0
 
 
 class TestValues:

@@ -35,6 +35,7 @@ LIMITS = InputLimits(
     temperature=ValueLimits(-60.0, 150.0, 2.0, 2.0, 3.0),
     friction=ValueLimits(0.05, 1.5, math.inf, math.inf, 0.0),
     wheels=WheelLimits(ValueLimits(-200.0, 200.0, 1000.0, 1000.0, 2.0), 2.0, 1.0, 1.0, 1.0, 1.0, 20.0, 0.0),
+    rival_s=0.3,
     radius_m=0.5,
 )
 
@@ -94,6 +95,105 @@ class TestTally:
         assert tally.violation is Violation.NOT_FINITE
         tally.note(Violation.NONE, NOW + 2 * MS)
         assert tally.violation is Violation.NONE
+
+
+class TestSecondSource:
+    """Two publishers of one topic: the one that was accepted last is not believed for ever."""
+
+    @staticmethod
+    def both(
+        monitor: InputMonitor, ms: int, first: float, second: float, wheels_mps: float | None = None
+    ) -> list[bool]:
+        """A message of each, a little apart, at a time; whether they were accepted."""
+        now = NOW + ms * MS
+        if wheels_mps is not None:
+            monitor.take_wheels(wheels(now, (wheels_mps / 0.5,) * 4), now)
+        return [
+            monitor.take_speed(SpeedReading(now + k * MS, speed), now + k * MS)
+            for k, speed in ((0, first), (1, second))
+        ]
+
+    def test_whoever_agrees_with_the_wheels_is_believed_after_a_while_and_stays_so(self, monitor) -> None:
+        found = [self.both(monitor, 10 * i, 10.0, 20.0, wheels_mps=20.0) for i in range(60)]
+        assert found[0] == [True, False]
+        changed = found.index([True, True])
+        assert changed == 30
+        assert found[:changed] == [[True, False]] * changed
+        assert found[changed + 1 :] == [[False, True]] * (59 - changed)
+        assert monitor.speed_mps == 20.0
+
+    def test_who_is_farther_from_the_wheels_or_as_far_is_not(self, monitor) -> None:
+        assert [self.both(monitor, 10 * i, 10.0, 20.0, wheels_mps=12.0)[1] for i in range(60)] == [False] * 60
+        assert [self.both(monitor, 600 + 10 * i, 10.0, 14.0, wheels_mps=12.0)[1] for i in range(60)] == [False] * 60
+
+    def test_the_two_middle_wheels_tell(self, monitor) -> None:
+        for i in range(32):
+            now = NOW + 10 * i * MS
+            monitor.take_wheels(wheels(now, (0.0, 36.0, 40.0, 60.0)), now)
+            self.both(monitor, 10 * i, 10.0, 19.0)
+        assert monitor.speed_mps == 19.0
+
+    def test_where_no_wheels_have_come_of_late_they_take_turns(self, monitor) -> None:
+        monitor.take_wheels(wheels(NOW - 310 * MS), NOW - 310 * MS)
+        assert self.both(monitor, 0, 10.0, 20.0) == [True, False]
+        speeds = []
+        for i in range(1, 100):
+            self.both(monitor, 10 * i, 10.0, 20.0)
+            speeds.append(monitor.speed_mps)
+        assert speeds.index(20.0) == 29
+        assert 10.0 in speeds[30:]
+
+    def test_stamps_that_run_ahead_do_not_have_the_topic_for_themselves(self, monitor) -> None:
+        for i in range(60):
+            now = NOW + 10 * i * MS
+            monitor.take_wheels(wheels(now, (20.0,) * 4), now)
+            monitor.take_speed(SpeedReading(now + 15 * MS, 10.0 + 0.1 * i), now)
+            monitor.take_speed(SpeedReading(now, 10.0), now)
+            if i > 33:  # the walk is out of what is believed by now
+                assert monitor.speed_mps == 10.0
+
+    @pytest.mark.parametrize("gap_ms", [310, 10_000])
+    def test_messages_too_far_apart_are_no_source(self, monitor, gap_ms: int) -> None:
+        for i in range(12 * gap_ms // 10):
+            second = [SpeedReading(NOW + 10 * i * MS + MS, 20.0)] if 10 * i % gap_ms < 10 else []
+            monitor.take_speed(SpeedReading(NOW + 10 * i * MS, 10.0), NOW + 10 * i * MS)
+            assert not any(monitor.take_speed(reading, reading.stamp_ns) for reading in second)
+
+    @pytest.mark.parametrize("spoilt", [math.nan, 1000.0])
+    def test_impossible_values_are_no_source(self, monitor, spoilt: float) -> None:
+        assert [self.both(monitor, 10 * i, 10.0, spoilt)[1] for i in range(60)] == [False] * 60
+        for i in range(60):  # nor with stamps that are not newer
+            now = NOW + 600 * MS + 10 * i * MS
+            monitor.take_speed(SpeedReading(now, 10.0), now)
+            assert not monitor.take_speed(SpeedReading(now - MS, spoilt), now)
+
+    def test_frozen_messages_are_no_source(self, monitor) -> None:
+        for i in range(60):
+            now = NOW + 10 * i * MS
+            assert monitor.take_speed(SpeedReading(now, 10.0), now)
+            assert not monitor.take_speed(SpeedReading(NOW - 10 * MS, 20.0), NOW)
+
+    def test_a_source_alone_that_jumped_waits_as_long_as_the_rate_says(self, monitor) -> None:
+        assert monitor.take_speed(SpeedReading(NOW, 10.0), NOW)
+        accepted = [monitor.take_speed(SpeedReading(NOW + 10 * i * MS, 30.0), NOW + 10 * i * MS) for i in range(1, 110)]
+        assert accepted.index(True) + 1 == 98  # 20 m/s less 0.5 at 20 m/s2
+
+    def test_after_the_clock_was_set_back_nothing_is_remembered(self, monitor) -> None:
+        for i in range(30):
+            self.both(monitor, 10 * i, 10.0, 20.0)
+        monitor.forget_times()
+        assert self.both(monitor, 300, 10.0, 20.0) == [True, False]
+
+    def test_two_batteries_take_turns_ten_times_as_slowly(self, monitor) -> None:
+        charges = []
+        for i in range(70):
+            now = NOW + 100 * i * MS
+            monitor.take_battery(battery(now, 0.5), now)
+            monitor.take_battery(battery(now + MS, 0.9), now + MS)
+            charges.append(monitor.soc)
+        assert charges[:30] == [0.5] * 30
+        assert 29 < charges.index(0.9) < 33
+        assert 0.5 in charges[33:]
 
 
 class TestSpeed:

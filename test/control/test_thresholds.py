@@ -52,7 +52,7 @@ def test_each_threshold_is_where_it_belongs():
     assert limits.temperature[:2] == (t.temperature_min_c, t.temperature_max_c)
     assert limits.temperature[2:] == (t.temperature_rate_cps, t.temperature_rate_cps, t.temperature_noise_c)
     assert limits.friction == (t.friction_min, t.friction_max, math.inf, math.inf, 0.0)
-    assert limits.radius_m == 0.3
+    assert (limits.rival_s, limits.radius_m) == (t.rival_s, 0.3)
     wheels = limits.wheels
     assert wheels.value[:2] == (-t.wheel_speed_max_radps, t.wheel_speed_max_radps)
     assert wheels.value[2:] == (t.wheel_rate_radps2, t.wheel_rate_radps2, t.wheel_noise_radps)

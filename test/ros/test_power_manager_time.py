@@ -183,3 +183,30 @@ class TestSimulatedTime:
         bench.drive(lambda: bench.last("front_left_motor_torque_nm") == 0.0, "zero torque", without=every)
         bench.drive(lambda: bench.mode() == 1, "recovery")
         assert all(math.isfinite(s["front_left_motor_torque_nm"]) for s in bench.states[start:])
+
+    @pytest.mark.parametrize("back_s", [0.05, 0.5, 5.0])
+    def test_a_clock_set_back_holds_the_braking(self, bench, back_s) -> None:
+        def braking() -> float:
+            return sum(bench.torques[-1].effort) + sum(bench.frictions[-1].effort)
+
+        asked = -8000.0 / 10.0 * 0.33
+        bench.now_ns += int(back_s * 1e9)  # so that the clock never goes below zero
+        sent = bench.now_ns
+        bench.drive(
+            lambda: bench.state_stamps[-1] > sent + 10**9 and bench.mode() == 1 and braking() < 0.95 * asked,
+            "braking",
+            demand=-8000.0,
+        )
+        bench.now_ns -= int(back_s * 1e9)
+        start = len(bench.states)
+        every = ("vehicle_speed", "wheel_states", "power_demand", "battery_state")
+        found: list[float] = []
+
+        def noting(steps: int) -> bool:
+            found.append(braking())
+            return len(bench.states) >= start + steps
+
+        bench.drive(lambda: noting(5), "steps without an input of the new time", without=every, demand=-8000.0)
+        bench.drive(lambda: noting(60), "steps", demand=-8000.0)
+        assert max(found) < 0.85 * asked
+        bench.drive(lambda: bench.mode() == 1, "recovery")

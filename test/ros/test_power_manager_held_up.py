@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process is stopped, whenever and however long: nothing old is published, torque comes back by the ramps."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import random
+import signal
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from rolling_car import Heard, RollingCar
+
+from iwm_power_manager.control.settings import DEFAULTS
+from iwm_power_manager.control.thresholds import Thresholds
+
+T = Thresholds()
+DRIVE_W, BRAKE_W = 5000.0, -6000.0
+NS_PER_S = 1e9
+
+
+class Hold(NamedTuple):
+    """What came of one stop: its length, and when it ended; the commands that were published after it."""
+
+    length_s: float
+    ended_ns: int
+    motors: list[Heard]
+    brakes: list[Heard]
+    first_braking_s: float
+
+
+def hold(car: RollingCar, process_id: int, length_s: float, phase_s: float, brakes: bool) -> Hold:
+    """Drive, stop the process, and drive on or brake from that moment; returns when it drives again."""
+    bench = car.bench
+    car.roll(lambda: bench.mode() == 1 and car.motors[-1].torque_nm > 100.0, "torque", lambda: DRIVE_W)
+    due = time.monotonic() + phase_s
+    car.roll(lambda: time.monotonic() >= due, "the moment", lambda: DRIVE_W)
+    after_w = BRAKE_W if brakes else DRIVE_W
+    os.kill(process_id, signal.SIGSTOP)
+    try:
+        due = time.monotonic() + length_s
+        car.roll(lambda: time.monotonic() >= due, "the end of the stop", lambda: after_w)
+        heard = len(car.motors), len(car.brakes)
+        ended_ns = time.time_ns()
+    finally:
+        os.kill(process_id, signal.SIGCONT)
+    car.roll(
+        lambda: any(h.stamp_ns >= ended_ns + 0.2 * NS_PER_S for h in car.brakes[heard[1] :]),
+        "commands",
+        lambda: after_w,
+    )
+    braking = [h.stamp_ns for h in car.brakes[heard[1] :] if h.torque_nm < -100.0]
+    car.roll(lambda: bench.mode() == 1 and car.motors[-1].torque_nm > 100.0, "torque again", lambda: DRIVE_W)
+    first_braking_s = (braking[0] - ended_ns) / NS_PER_S if braking else float("nan")
+    return Hold(length_s, ended_ns, car.motors[heard[0] :], car.brakes[heard[1] :], first_braking_s)
+
+
+def published_ms(found: Hold) -> list[float]:
+    """Age at which each command was published after the stop, by the sender's own clock."""
+    return [(h.sent_ns - h.stamp_ns) / 1e6 for h in (*found.motors, *found.brakes) if h.sent_ns >= found.ended_ns]
+
+
+def caught_in_the_middle(found: Hold) -> int:
+    """Commands that DDS had taken before the stop and sent on after it."""
+    return sum(
+        h.sent_ns < found.ended_ns - found.length_s * NS_PER_S and h.received_ns >= found.ended_ns
+        for h in (*found.motors, *found.brakes)
+    )
+
+
+def check(found: Hold, brakes: bool) -> None:
+    assert max(published_ms(found)) <= T.command_oldest_s * 1e3
+    steps = [h for h in found.motors if h.stamp_ns >= found.ended_ns]
+    longest_s = T.longest_step_periods * 0.01
+    for before, after in itertools.pairwise(steps):
+        assert max(after.torque_nm, 0.0) - max(before.torque_nm, 0.0) <= 4.0 * DEFAULTS.slew_up_nmps * longest_s
+    if found.length_s > 1.2 * T.own_gap_s:
+        # It starts over: no torque until inputs have been good again.
+        began_ns = steps[0].stamp_ns
+        good_ns = (T.recover_s - 0.03) * NS_PER_S
+        assert all(step.torque_nm <= 0.0 for step in steps if step.stamp_ns < began_ns + good_ns)
+        if brakes:
+            assert found.first_braking_s < 1.0  # nobody waits for a ramp who brakes
+
+
+def run(start_pair, count: int, seed: int) -> list[Hold]:
+    pair = start_pair()
+    pair.bench.connect()
+    car = RollingCar(pair.bench, 10.0)
+    source = random.Random(seed)
+    found = []
+    for i in range(count):
+        # Half of the stops are short: below the node's own gap, and around it.
+        length_s = source.uniform(0.05, 0.3) if i % 2 else source.uniform(0.05, 5.0 if count > 10 else 1.0)
+        found.append(hold(car, pair.running.process.pid, length_s, source.uniform(0.0, 0.02), brakes=i % 3 > 0))
+        check(found[-1], brakes=i % 3 > 0)
+        del car.motors[:-1], car.brakes[:-1], pair.bench.states[:-1], pair.bench.torques[:-1]
+    assert pair.running.process.poll() is None
+    return found
+
+
+def test_no_old_command_is_published_after_a_stop(start_pair) -> None:
+    run(start_pair, 5, 1)
+
+
+@pytest.mark.nightly
+def test_two_hundred_stops(start_pair) -> None:
+    """Prints what docs/safety.md says; `-s` shows it."""
+    found = run(start_pair, 200, int(os.environ.get("HELD_UP_SEED", "1")))
+    ages = sorted(age for one in found for age in published_ms(one))
+    summary = {
+        "stops": len(found),
+        "stopped for (s)": sum(one.length_s for one in found),
+        "commands published after a stop": len(ages),
+        "oldest (ms)": ages[-1],
+        "99.9 % younger than (ms)": ages[int(0.999 * len(ages))],
+        "caught inside DDS": sum(map(caught_in_the_middle, found)),
+        "longest until the brakes (s)": max(
+            one.first_braking_s for one in found if one.first_braking_s == one.first_braking_s
+        ),
+    }
+    print(json.dumps(summary, indent=1))
+    if out := os.environ.get("HELD_UP_RESULT"):
+        Path(out).write_text(json.dumps(summary, indent=1) + "\n")
