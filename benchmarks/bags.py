@@ -29,7 +29,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from iwm_power_manager.bags.metadata import Qos, Topic
+from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.recording import Recording
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
@@ -102,7 +102,7 @@ def _write(folder: Path, count: int) -> dict[str, float]:
         return path
 
     def topics(add: Callable[[Topic], int]) -> list[int]:
-        return [add(Topic(f"/topic_{i}", JOINT_STATE, *definition, (Qos(),))) for i in range(TOPICS)]
+        return [add(Topic(f"/topic_{i}", JOINT_STATE, *definition, (DEFAULT_QOS,))) for i in range(TOPICS)]
 
     def ours(compression: str) -> int:
         with BagWriter(fresh(), WriterOptions(compression=compression)) as bag:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from iwm_power_manager.bags.metadata import Qos, Topic
+from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
@@ -41,7 +41,7 @@ def float64(value: float) -> bytes:
 
 def topic(name: str, msgtype: str = FLOAT64) -> Topic:
     """A topic with its true definition and hash."""
-    return Topic(name, msgtype, *definition_of(msgtype), (Qos(),))
+    return Topic(name, msgtype, *definition_of(msgtype), (DEFAULT_QOS,))
 
 
 class ScriptedDrive:

@@ -23,8 +23,11 @@ MAX_CHUNK_BYTES = 256 * _MEBIBYTE
 #: What is decompressed, by what it was decompressed from; small things may be more.
 MAX_RATIO = 1000
 FREE_BYTES = 16 * _MEBIBYTE
-#: Chunks that overlap in time are in memory together.
-MAX_OVERLAP_BYTES = 1024 * _MEBIBYTE
+#: Messages in one chunk, and the memory of those that wait for chunks that overlap theirs in time.
+MAX_CHUNK_MESSAGES = 1_000_000
+MAX_OVERLAP_BYTES = 512 * _MEBIBYTE
+#: Memory one message takes besides its bytes: the tuple, its integers, the bytes object's head.
+MESSAGE_OVERHEAD_BYTES = 250
 #: Records at the top of one file, and channels in it.
 MAX_RECORDS = 20_000_000
 MAX_CHANNELS = 10_000

@@ -2,24 +2,32 @@
 """One MCAP file being written by the `mcap` package, so that whatever happens to it, it ends with a whole record.
 
 The package's writer hands its bytes to a buffer, and from there they go into the file by unbuffered writes. So a chunk
-is in the file when `flush` returns, which is what makes a killed recorder's bag recoverable, and a write that the disk
+is in the file when `push` returns, which is what makes a killed recorder's bag recoverable, and a write that the disk
 refuses is cut off again. After that the package's writer is of no use: it has taken up what is not in the file. What is
 there stays readable without an index, and `recover` gives it one.
+
+rosbags' writer ends a chunk by its size alone, writes neither publish times nor sequence numbers, and one file
+(`McapWriter` in https://gitlab.com/ternaris/rosbags/-/blob/master/src/rosbags/rosbag2/storage_mcap.py).
 """
 
 from __future__ import annotations
 
 import errno
 import os
+import struct
 from collections import Counter
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, cast
 
-from mcap.records import Attachment
+from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
+from iwm_power_manager.bags.mcap_records import MAGIC, walk
+
 COMPRESSIONS = ("none", "lz4", "zstd")
+_SPAN = struct.Struct("<QQ")
+_INDEX = struct.Struct("<HI")
+_INDEX_ENTRY_BYTES = 16
 
 
 class _Buffer:
@@ -54,16 +62,16 @@ class McapFile:
 
     Attributes
     ----------
+    writer : the package's; after whatever was done with it, `push` brings what it has written into the file
+    pieces : what it has written since then
     size_bytes : what is in the file so far
-    message_count, channel_counts, start_time_ns, end_time_ns : of the messages in closed chunks; times are 0 while
-        there are none
-    pending_count : messages that are in memory only
+    counts, start_time_ns, end_time_ns : messages by channel, and their log times, in the file; 0 while there are none
     broken : a write has failed
 
     Raises
     ------
     OSError
-        From any writing method. Whatever is in the file then ends with a whole record: a half-written one is cut off.
+        From any method that writes. What is in the file then ends with a whole record: a half-written one is cut off.
         Of the messages in memory nothing is left, what comes later is refused, and the file gets no index.
     """
 
@@ -78,99 +86,70 @@ class McapFile:
     ) -> None:
         self.path = path
         self.size_bytes = 0
-        self.message_count = 0
         self.start_time_ns = 0
         self.end_time_ns = 0
-        self.channel_counts: dict[int, int] = {}
-        self._pending: list[int] = []  # the messages' channels
-        self._times: list[int] = []  # and log times
-        self._schema_ids: dict[tuple[str, str, bytes], int] = {}
+        self.counts: Counter[int] = Counter()
         self.broken = False
+        self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self._buffer = _Buffer()
-        self._pieces = self._buffer.pieces
-        # Chunks are closed by the writer when they are large enough, and here by time.
-        self._writer = Writer(
+        self.pieces = self._buffer.pieces
+        # Chunks are closed by the writer when they are large enough, and by whoever calls `flush`, in time.
+        self.writer = Writer(
             cast("IO[bytes]", self._buffer), chunk_size=chunk_bytes, compression=CompressionType[compression.upper()]
         )
-        self._add: Callable[..., None] = self._writer.add_message
         self._stream: IO[bytes] = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by finish() or abandon()
-        self._writer.start(profile, library)
+        self.writer.start(profile, library)
         try:
-            self._push()
+            self.push()
         except OSError:
             self.remove()
             raise
 
     @property
-    def pending_count(self) -> int:
-        """Messages that are in memory only."""
-        return len(self._pending)
+    def message_count(self) -> int:
+        """Messages in the file."""
+        return self.counts.total()
 
     def schema_id(self, name: str, encoding: str, data: bytes) -> int:
         """Id of a schema, the same for the same schema."""
         key = (name, encoding, data)
         if key not in self._schema_ids:
-            self._schema_ids[key] = self._writer.register_schema(name, encoding, data)
-            if self._pieces:
-                self._take_up()
+            self._schema_ids[key] = self.writer.register_schema(name, encoding, data)
         return self._schema_ids[key]
 
-    def add_channel(self, topic: str, schema_id: int, metadata: Mapping[str, str], encoding: str = "cdr") -> int:
-        """Announce a channel; returns its id. It is in the file with the first chunk that follows."""
-        channel = self._writer.register_channel(topic, encoding, schema_id, dict(metadata))
-        self.channel_counts[channel] = 0
-        if self._pieces:  # that has closed a chunk
-            self._take_up()
-        return channel
-
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Write a metadata record now, outside of any chunk."""
-        self._check()
-        self._writer.add_metadata(name, dict(values))
-        self._push()
-
-    def add_attachment(self, attachment: Attachment) -> None:
-        """Write an attachment now, outside of any chunk."""
-        self._check()
-        self._writer.add_attachment(
-            attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
-        )
-        self._push()
+    def push(self) -> None:
+        """Bring what the writer has written into the file, and count it."""
+        if self.broken:
+            raise OSError(errno.EIO, "an earlier write has failed")
+        data = b"".join(self.pieces)
+        self.pieces.clear()
+        try:
+            if self.size_bytes and os.fstat(self._stream.fileno()).st_nlink == 0:
+                raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
+            self._append(data)
+        except OSError:
+            self.broken = True
+            raise
+        for record in walk(data, 0 if self.size_bytes > len(data) else len(MAGIC)):
+            if record.opcode == Opcode.CHUNK:
+                start_ns, end_ns = _SPAN.unpack_from(data, record.body)
+                self.start_time_ns = min(self.start_time_ns, start_ns) if self.counts else start_ns
+                self.end_time_ns = max(self.end_time_ns, end_ns)
+            elif record.opcode == Opcode.MESSAGE_INDEX:
+                channel, entries_bytes = _INDEX.unpack_from(data, record.body)
+                self.counts[channel] += entries_bytes // _INDEX_ENTRY_BYTES
 
     def add_record(self, record: bytes) -> None:
-        """Write a record as it is; for kinds that are not in the index."""
-        self._check()
+        """Write a record as it is, behind those before it; for kinds that are not in the index."""
         self._buffer.write(record)
-        self._push()
-
-    def write(self, channel: int, log_time_ns: int, publish_time_ns: int, sequence: int, data: bytes) -> None:
-        """Add a message to the chunk in memory; all numbers >= 0."""
-        self._add(channel, log_time_ns, data, publish_time_ns, sequence)
-        self._pending.append(channel)
-        self._times.append(log_time_ns)
-        if self._pieces:  # the writer has closed a chunk
-            self._take_up()
+        self.push()
 
     def flush(self, sync: bool = False) -> None:
         """Write the chunk in memory, if it holds a message; with `sync` wait until the disk has it."""
-        if self._pending:
-            self._writer.flush()
-            self._take_up()
+        self.writer.flush()
+        self.push()
         if sync:
             os.fdatasync(self._stream.fileno())
-
-    def _take_up(self) -> None:
-        """Bring a closed chunk into the file, and count its messages."""
-        pending, times = self._pending, self._times
-        self._pending, self._times = [], []
-        self._push()
-        self.start_time_ns = min(times) if not self.message_count else min(self.start_time_ns, min(times))
-        self.end_time_ns = max(self.end_time_ns, max(times))
-        self.message_count += len(pending)
-        for channel, count in Counter(pending).items():
-            self.channel_counts[channel] += count
-        if os.fstat(self._stream.fileno()).st_nlink == 0:
-            raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
 
     def duplicate_descriptor(self) -> int:
         """A descriptor of the open file that stays valid when this one is closed."""
@@ -180,9 +159,8 @@ class McapFile:
         """Write the last chunk and the index, and close the file."""
         try:
             self.flush()
-            self._check()
-            self._writer.finish()
-            self._push()
+            self.writer.finish()
+            self.push()
             os.fsync(self._stream.fileno())
         finally:
             self._stream.close()
@@ -195,21 +173,6 @@ class McapFile:
         """Close the file and delete it."""
         self._stream.close()
         self.path.unlink(missing_ok=True)
-
-    def _check(self, *_: object) -> None:
-        if self.broken:
-            raise OSError(errno.EIO, "an earlier write has failed")
-
-    def _push(self) -> None:
-        """Bring what the writer has written into the file."""
-        data = b"".join(self._buffer.pieces)
-        self._buffer.pieces.clear()
-        try:
-            self._append(data)
-        except OSError:
-            self.broken = True
-            self._add = self._check
-            raise
 
     def _append(self, data: bytes) -> None:
         view = memoryview(data)

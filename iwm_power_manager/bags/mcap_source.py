@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of one MCAP file, whole or damaged.
 
-A whole file's index is read by the `mcap` package. Where it is missing or makes no sense, the file is gone through
-record by record, which finds the same. Chunks are unpacked when their turn comes. (Of a whole file `rosbags` reads
-neither publish times nor sequence numbers, see `storage_mcap.msgsrc`, and a lock-step replay needs both.)
+One way for both: the records are gone through once (a chunk of a megabyte is one of them); the summary of a whole file
+says what is in the chunks, else they are opened to see. Chunks are unpacked when their turn comes. Of a whole file
+rosbags reads neither publish times nor sequence numbers, and a lock-step replay needs both (`msgsrc` in
+https://gitlab.com/ternaris/rosbags/-/blob/master/src/rosbags/rosbag2/storage_mcap.py); the readers of `mcap` take what
+a frame says for its size, see `bags.limits`.
 """
 
 from __future__ import annotations
@@ -12,26 +14,26 @@ import heapq
 import mmap
 import struct
 import zlib
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
-from operator import attrgetter
+from itertools import count
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import Header, MessageIndex, Metadata
+from mcap.records import Header, Metadata, Statistics
 
-from iwm_power_manager.bags.limits import MAX_OVERLAP_BYTES, decompress, regular_file
+from iwm_power_manager.bags.limits import MAX_OVERLAP_BYTES, MESSAGE_OVERHEAD_BYTES, decompress, regular_file
 from iwm_power_manager.bags.mcap_records import (
-    HEAD_BYTES,
     MAGIC,
     UNREADABLE,
-    ChunkMessage,
+    ChannelMessage,
     Definitions,
     Record,
-    chunk_head,
+    read_chunk,
     read_record,
     split,
     walk,
@@ -39,21 +41,17 @@ from iwm_power_manager.bags.mcap_records import (
 from iwm_power_manager.bags.metadata import CUSTOM_METADATA, Topic, information_of, parse_qos, text_values
 from iwm_power_manager.errors import BagError
 
-#: Footer record and closing magic, and in front of them the checksum of the summary.
-_FOOTER = struct.Struct("<BQQQI8s")
+_SPAN = struct.Struct("<QQ")
 #: Messages that stand outside of chunks are read in pieces of about this size.
 _RUN_BYTES = 1024 * 1024
+_NEVER = 2**64
 
 
 class Piece(NamedTuple):
-    """A chunk, or a stretch of messages outside of chunks: log times it spans, where it is, bytes it unpacks to."""
+    """A chunk, or a stretch of messages outside of chunks: its first log time, and where it is."""
 
     start_ns: int
-    end_ns: int
-    start: int
-    end: int
-    size: int
-    is_chunk: bool
+    record: Record
 
 
 class McapSource:
@@ -72,7 +70,6 @@ class McapSource:
     counts : messages by channel, as far as chunks can be read
     metadata : contents of metadata records, by name
     start_ns, end_ns : log times of the messages; 0 if there is none
-    indexed : the file was finished by its writer
 
     Raises
     ------
@@ -86,9 +83,10 @@ class McapSource:
         self.definitions = Definitions()
         self.counts: Counter[int] = Counter()
         self.metadata: dict[str, dict[str, str]] = {}
+        self.header = Header(profile="ros2", library="")
+        self.start_ns = self.end_ns = 0
         self._pieces: list[Piece] = []
-        size = regular_file(path)
-        if size == 0:
+        if regular_file(path) == 0:
             raise BagError(f"{path}: is empty")
         try:
             with path.open("rb") as stream:
@@ -97,17 +95,13 @@ class McapSource:
             raise BagError(f"{path}: cannot be read: {error.strerror or error}") from None
         if self.data[: len(MAGIC)] != MAGIC:
             raise BagError(f"{path}: is no MCAP file")
-        self.indexed = self._read_index()
-        if not self.indexed:
-            self._scan()
-        if not self.definitions.channels or self.counts.keys() - self.definitions.channels.keys():
-            for piece in self._pieces:  # announced inside of chunks only
-                self.unpack(piece)
-            self.damage = list(dict.fromkeys(self.damage))
-        self._pieces = [self._as_read(piece) if piece.start_ns >= piece.end_ns else piece for piece in self._pieces]
-        filled = [piece for piece in self._pieces if piece.start_ns <= piece.end_ns]
-        self.start_ns = min((piece.start_ns for piece in filled), default=0)
-        self.end_ns = max((piece.end_ns for piece in filled), default=0)
+        statistics = self._survey()
+        known = self.definitions.channels.keys()
+        if statistics is not None and known and statistics.channel_message_counts.keys() <= known:
+            self.counts.update(statistics.channel_message_counts)
+            self.start_ns, self.end_ns = statistics.message_start_time, statistics.message_end_time
+        else:
+            self._open_all()
 
     # --- what the file is about -------------------------------------------------------------------------------------
 
@@ -127,13 +121,6 @@ class McapSource:
             )
         return found
 
-    def topic_counts(self) -> Counter[str]:
-        """Messages by topic."""
-        found: Counter[str] = Counter()
-        for number, channel in self.definitions.channels.items():
-            found[channel.topic] += self.counts[number]
-        return found
-
     def information(self) -> dict[str, Any]:
         """What rosbag2 keeps inside of the file of its `metadata.yaml`; {} if that is nothing or cannot be read."""
         return information_of(self.metadata.get("rosbag2", {}).get("serialized_metadata", ""))
@@ -142,222 +129,110 @@ class McapSource:
         """Custom metadata inside of the file, our own recorder's or rosbag2's."""
         return text_values(self.information().get("custom_data")) | self.metadata.get(CUSTOM_METADATA, {})
 
-    def header(self) -> Header:
-        """The file's head; an empty one if it is damaged."""
-        record = next(walk(self.data), None)
-        if record is not None and record.opcode == Opcode.HEADER:
-            try:
-                found: Header = read_record(Header, self.body(record))
-                return found
-            except BagError:
-                pass
-        return Header(profile="ros2", library="")
-
-    def body(self, record: Record) -> bytes:
-        """Content of a record."""
-        return bytes(self.data[record.body : record.end])
-
     # --- the survey -------------------------------------------------------------------------------------------------
 
-    def _read_index(self) -> bool:
-        """Take up the index at the file's end; False if there is none to rely on."""
-        data = self.data
-        if len(data) < _FOOTER.size or data[-len(MAGIC) :] != MAGIC:
-            return False
-        opcode, _, start, _, crc, _ = _FOOTER.unpack_from(data, len(data) - _FOOTER.size)
-        if opcode != Opcode.FOOTER or not 0 < start < len(data):
-            return False
-        if crc and zlib.crc32(data[start : len(data) - len(MAGIC) - 4]) != crc:
-            self.damage.append("its summary is damaged")
-            return False
+    def _survey(self) -> Statistics | None:
+        """Go through all records; returns the summary's statistics, if the file was finished."""
+        statistics: Statistics | None = None
+        record = None
+        for record in walk(self.data):
+            if record.opcode == Opcode.CHUNK:
+                self._pieces.append(Piece(_SPAN.unpack_from(self.data, record.body)[0], record))
+            elif record.opcode == Opcode.MESSAGE:
+                self._add_to_run(record)
+            elif record.opcode == Opcode.METADATA:
+                found = read_record(Metadata, self.data, record)
+                self.metadata.setdefault(found.name, {}).update(found.metadata)
+            elif record.opcode == Opcode.STATISTICS:
+                statistics = read_record(Statistics, self.data, record)
+            elif record.opcode == Opcode.HEADER:
+                self.header = read_record(Header, self.data, record)
+            elif record.opcode == UNREADABLE and record.end < len(self.data):
+                self._note(f"holds no record from byte {record.start} to {record.end}")
+                statistics = None
+            else:
+                self._take_definition(record)
+        if record is None or record.opcode != Opcode.FOOTER or self.data[record.end :] != MAGIC:
+            self._note("ends without a footer: the recorder did not finish it")
+            return None
+        start, _, crc = struct.unpack_from("<QQI", self.data, record.body)
+        if crc and (not start or zlib.crc32(self.data[start : record.end - 4]) != crc):
+            self._note("its summary is damaged")
+            return None
+        return None if self.damage else statistics
+
+    def _add_to_run(self, record: Record) -> None:
+        """A message outside of chunks: the run it belongs to is read in one piece, like a chunk."""
+        last = self._pieces[-1].record if self._pieces else None
+        if last and last.opcode == Opcode.MESSAGE and last.end == record.start and last.end - last.start < _RUN_BYTES:
+            record = last._replace(end=record.end)
+            self._pieces.pop()
+        self._pieces.append(Piece(0, record))
+
+    def _take_definition(self, record: Record) -> None:
         try:
-            reader = SeekingReader(data)
-            summary = reader.get_summary()
-            if summary is None or summary.statistics is None or not summary.chunk_indexes:
-                return False
-            for record in reader.iter_metadata():
-                self.metadata.setdefault(record.name, {}).update(record.metadata)
-        except Exception:  # noqa: BLE001 - the package lets through whatever damaged bytes make it raise
-            self.damage.append("its summary is damaged")
-            return False
-        pieces = [
-            Piece(
-                index.message_start_time,
-                index.message_end_time,
-                index.chunk_start_offset,
-                index.chunk_start_offset + index.chunk_length,
-                index.uncompressed_size,
-                True,
-            )
-            for index in summary.chunk_indexes
-        ]
-        if len({piece.start for piece in pieces}) < len(pieces) or any(piece.end > start for piece in pieces):
-            self.damage.append("its summary is damaged")
-            return False
-        self.definitions.schemas.update(summary.schemas)
-        self.definitions.channels.update(summary.channels)
-        self.counts.update(summary.statistics.channel_message_counts)
-        self._pieces = pieces
-        return True
+            self.definitions.take(self.data, record)
+        except BagError as error:
+            self._note(f"{error} at byte {record.start}")
 
-    def _scan(self) -> None:
-        """Go through all records."""
-        data = self.data
-        chunk: Piece | None = None  # the last one, whose index is still to come
-        run: list[Record] = []
-        ended = False
-        for record in walk(data):
-            if run and (record.opcode != Opcode.MESSAGE or record.end - run[0].start > _RUN_BYTES):
-                self._note_run(run)
-                run = []
-            if chunk is not None and record.opcode != Opcode.MESSAGE_INDEX:
-                self._note_chunk(chunk, None)
-                chunk = None
-            try:
-                if record.opcode == Opcode.CHUNK:
-                    head = chunk_head(data, record.body, record.end)
-                    chunk = Piece(head.start_ns, head.end_ns, record.start, record.end, head.size, True)
-                elif record.opcode == Opcode.MESSAGE_INDEX and chunk is not None:
-                    self._note_chunk(chunk, self.body(record))
-                    chunk = None
-                elif record.opcode == Opcode.MESSAGE_INDEX:
-                    self._count(self.body(record))
-                elif record.opcode == Opcode.MESSAGE:
-                    run.append(record)
-                elif record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self.definitions.take(record.opcode, self.body(record))
-                elif record.opcode == Opcode.METADATA:
-                    found = read_record(Metadata, self.body(record))
-                    self.metadata.setdefault(found.name, {}).update(found.metadata)
-                elif record.opcode == UNREADABLE:
-                    self._note_stretch(record)
-            except BagError as error:
-                self.damage.append(f"{error} at byte {record.start}")
-            ended = record.opcode in (Opcode.DATA_END, Opcode.FOOTER)
-        if run:
-            self._note_run(run)
-        if chunk is not None:
-            self._note_chunk(chunk, None)
-        if ended:
-            self._scan_summary(record.end)
-        if not ended or data[-len(MAGIC) :] != MAGIC:
-            self.damage.append("ends without a footer: the recorder did not finish it")
+    def _open_all(self) -> None:
+        """Look into every chunk: channels may be announced there and nowhere else, and its head may be wrong."""
+        pieces, self._pieces = self._pieces, []
+        end_ns = 0
+        for piece in pieces:
+            messages = self.unpack(piece)
+            self.counts.update(message[1] for message in messages)
+            if messages:
+                times = [message[0] for message in messages]
+                self._pieces.append(Piece(min(times), piece.record))
+                end_ns = max(end_ns, *times)
+        self.start_ns, self.end_ns = min((piece.start_ns for piece in self._pieces), default=0), end_ns
 
-    def _scan_summary(self, offset: int) -> None:
-        """Schemas and channels repeated after the data: other writers announce them inside of chunks only."""
-        for record in walk(self.data, offset):
-            if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                try:
-                    self.definitions.take(record.opcode, self.body(record))
-                except BagError as error:
-                    self.damage.append(f"{error} at byte {record.start}")
-
-    def _note_chunk(self, piece: Piece, index: bytes | None) -> None:
-        """A chunk, with the first record of its index; without one it is opened to see what is in it."""
-        if index is not None:
-            self._count(index)
-            self._pieces.append(piece)
-            return
-        messages = self.unpack(piece)
-        self.counts.update(message.channel_id for message in messages)
-        if messages:
-            self._pieces.append(piece)
-
-    def _count(self, index: bytes) -> None:
-        found = read_record(MessageIndex, index)
-        self.counts[found.channel_id] += len(found.records)
-
-    def _note_run(self, run: list[Record]) -> None:
-        piece = Piece(0, 0, run[0].start, run[-1].end, run[-1].end - run[0].start, False)
-        messages = self.unpack(piece)
-        times = [message.log_time_ns for message in messages]
-        self.counts.update(message.channel_id for message in messages)
-        if times:
-            self._pieces.append(piece._replace(start_ns=min(times), end_ns=max(times)))
-
-    def _note_stretch(self, record: Record) -> None:
-        if record.end < len(self.data):
-            self.damage.append(f"holds no record from byte {record.start} to {record.end}")
-
-    def _as_read(self, piece: Piece) -> Piece:
-        """A chunk that says it spans no time: with the times of its messages, or none of them."""
-        times = [message.log_time_ns for message in self.unpack(piece)]
-        return piece._replace(start_ns=min(times), end_ns=max(times)) if times else piece._replace(start_ns=1, end_ns=0)
+    def _note(self, line: str) -> None:
+        if line not in self.damage:
+            self.damage.append(line)
 
     # --- messages ---------------------------------------------------------------------------------------------------
 
-    def messages(self) -> Iterator[ChunkMessage]:
+    def messages(self) -> Iterator[ChannelMessage]:
         """All messages in the order of their log times; equal times keep the order of the file.
 
-        Memory: the chunks that overlap in time, usually one.
+        Memory: a chunk, and of those before it the messages that belong behind its first.
         """
-        pieces = sorted((piece for piece in self._pieces if piece.start_ns <= piece.end_ns), key=attrgetter("start_ns"))
-        group: list[Piece] = []
-        end_ns = -1
-        for piece in pieces:
-            if group and piece.start_ns >= end_ns:
-                yield from self._merged(group)
-                group = []
-            group.append(piece)
-            end_ns = max(end_ns, piece.end_ns)
-        yield from self._merged(group)
-
-    def _merged(self, group: list[Piece]) -> Iterator[ChunkMessage]:
-        """Messages of chunks that overlap one another in time."""
-        if len(group) == 1:
-            yield from self._sorted(group[0])
-            return
-        if _largest_overlap(group) > MAX_OVERLAP_BYTES:
-            self.damage.append(
-                "its chunks overlap in time by more than fits into memory: read in the order of the file"
-            )
-            for piece in sorted(group, key=attrgetter("start")):
-                yield from self._sorted(piece)
-            return
-        # A mark in front of each chunk keeps it packed until its time has come.
-        streams = [self._marked(piece) for piece in group]
-        for message in heapq.merge(*streams, key=_log_time):
-            if message is not None and message.offset >= 0:
+        pieces = sorted(self._pieces, key=itemgetter(0))
+        waiting: list[tuple[int, int, ChannelMessage]] = []
+        order, size = count(), 0
+        for piece, next_ns in zip(pieces, [*(piece.start_ns for piece in pieces[1:]), _NEVER], strict=False):
+            messages = sorted(self.unpack(piece), key=itemgetter(0))
+            ready = 0 if waiting else bisect_right(messages, next_ns, key=itemgetter(0))
+            yield from messages[:ready]
+            for message in messages[ready:]:
+                size += len(message[2]) + MESSAGE_OVERHEAD_BYTES
+                heapq.heappush(waiting, (message[0], next(order), message))
+            if size > MAX_OVERLAP_BYTES:
+                self._note("its chunks overlap in time by more than fits into memory: not all is in order")
+                next_ns = _NEVER
+            while waiting and waiting[0][0] <= next_ns:
+                message = heapq.heappop(waiting)[2]
+                size -= len(message[2]) + MESSAGE_OVERHEAD_BYTES
                 yield message
 
-    def _marked(self, piece: Piece) -> Iterator[ChunkMessage]:
-        yield ChunkMessage(piece.start_ns, 0, b"", 0, 0, -1)
-        yield from self._sorted(piece)
-
-    def _sorted(self, piece: Piece) -> list[ChunkMessage]:
-        return sorted(self.unpack(piece), key=_log_time)
-
-    def unpack(self, piece: Piece) -> list[ChunkMessage]:
+    def unpack(self, piece: Piece) -> list[ChannelMessage]:
         """Messages of a chunk in the order of the file; none, and a line of damage, if it cannot be unpacked."""
+        record = piece.record
         try:
-            if not piece.is_chunk:
-                return split(self.data[piece.start : piece.end], self.definitions)
-            return split(self.raw(piece.start, piece.end), self.definitions)
+            return split(
+                self.raw(record) if record.opcode == Opcode.CHUNK else self.data[record.start : record.end],
+                self.definitions,
+            )
         except BagError as error:
-            self.damage.append(f"the chunk at byte {piece.start} {error}")
+            self._note(f"the chunk at byte {record.start} {error}")
             return []
 
-    def raw(self, start: int, end: int) -> bytes:
-        """Content of the chunk whose record spans these bytes; `BagError` if it is damaged or too large."""
-        head = chunk_head(self.data, start + HEAD_BYTES, end)
-        if self.data[start] != Opcode.CHUNK or head.end > end:
-            raise BagError("is damaged")
-        raw = decompress(head.compression, self.data[head.data : head.end], head.size)
-        if head.crc and zlib.crc32(raw) != head.crc:
+    def raw(self, record: Record) -> bytes:
+        """Content of a chunk; `BagError` if it is damaged or too large."""
+        chunk = read_chunk(self.data, record)
+        raw = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
+        if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:
             raise BagError("is damaged: its checksum is wrong")
         return raw
-
-
-_log_time = attrgetter("log_time_ns")
-
-
-def _largest_overlap(group: list[Piece]) -> int:
-    """The most bytes of chunks that are to be in memory at one time."""
-    changes = sorted(
-        [(piece.start_ns, piece.size) for piece in group] + [(piece.end_ns, -piece.size) for piece in group]
-    )
-    most = present = 0
-    for _, change in changes:
-        present += change
-        most = max(most, present)
-    return most

@@ -86,7 +86,8 @@ class BagReader:
         self.custom_data = text_values(self.information.get("custom_data"))
         for source in self.sources:
             self._take_topics(source)
-            self.counts.update(source.topic_counts())
+            for number, topic in source.topics().items():
+                self.counts[topic.name] += source.counts[number]
             self.custom_data = source.custom_data() | self.custom_data
         filled = [source for source in self.sources if source.counts.total()]
         self.start_ns = min((source.start_ns for source in filled), default=0)
@@ -126,7 +127,7 @@ class BagReader:
     def _messages_of(self, source: Source) -> Iterator[Message]:
         names = {number: topic.name for number, topic in source.topics().items()}
         homeless = unpackable = 0
-        for log_time, channel, data, publish_time, sequence, _ in source.messages():
+        for log_time, channel, data, publish_time, sequence in source.messages():
             name = names.get(channel)
             if name is None:
                 homeless += 1

@@ -19,15 +19,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from iwm_power_manager.bags.limits import MESSAGE_OVERHEAD_BYTES
 from iwm_power_manager.bags.metadata import Topic
-from iwm_power_manager.bags.writer import BagWriter, MessageTooLarge, WriterOptions
+from iwm_power_manager.bags.writer import BagWriter, MessageTooLarge, WriteFailed, WriterOptions
 from iwm_power_manager.errors import BagError
 
 #: One message: topic number, log time (ns), CDR bytes, publish time (ns), the publisher's counter.
 Sample = tuple[int, int, bytes, int, int]
-
-#: Memory one queued message takes besides its bytes: the tuple, its integers, the bytes object's head.
-SAMPLE_OVERHEAD_BYTES = 250
 
 RECORDING, STOPPED, FAILED = "recording", "stopped", "failed"
 
@@ -108,24 +106,19 @@ class Recording:
         self._topic_count = 0
         self._announced: list[Topic] = []  # by the writing thread, in the order of their numbers
         self._wake = threading.Condition()
-        self._queue: deque[list[Sample] | Callable[[], None]] = deque()
-        self._queue_bytes = 0
-        self._queue_count = 0
-        self._queue_peak = 0
-        self._dropped_queue = 0
-        self._dropped_size = 0
-        self._dropped_error = 0
+        self._queue: deque[tuple[list[Sample], int] | Callable[[], object]] = deque()
+        self._queue_bytes = self._queue_count = self._queue_peak = 0
+        self._dropped_queue = self._dropped_size = self._dropped_error = 0
         self._error = ""
         self._state = STOPPED
         self._writer: BagWriter | None = None
+        self._last: BagWriter | None = None  # the bag being written, or the one before
         self._given = 0  # messages given to the current bag
         self._written_before = 0  # messages in the bags before it
-        self._status = RecordingStatus(STOPPED, "", 0, 0, 0, 0, 0, 0, 0, 0, 0, 0.0, "")
-        self._starts = 0
-        self._snapshots = 0
+        self._starts = self._snapshots = 0
         self._memory: deque[Sample] = deque()
         self._memory_bytes = 0
-        self._last_flush = time.monotonic()
+        self._next_flush = time.monotonic()
         self._disk = ThreadPoolExecutor(1, "disk")
         self._syncing: Future[None] | None = None
         self._on_disk_until: float | None = None  # what was given before is on the disk; None while nothing is written
@@ -136,31 +129,19 @@ class Recording:
     # --- called by the thread that takes messages -------------------------------------------------------------------
 
     def put(self, samples: list[Sample]) -> None:
-        """Hand over messages in the order of their log times; never blocks."""
-        if not samples:
-            return
-        size = sum(len(sample[2]) for sample in samples) + SAMPLE_OVERHEAD_BYTES * len(samples)
+        """Hand over messages in the order of their log times, and their list; never blocks."""
+        size = _size(samples)
         with self._wake:
-            if self._queue_bytes + size > self.options.queue_bytes:
-                samples, size = self._fitting(samples)
-                if not samples:
-                    return
-            self._queue.append(samples)
+            while samples and self._queue_bytes + size > self.options.queue_bytes:
+                size -= _size([samples.pop()])
+                self._dropped_queue += 1
+            if not samples:
+                return
+            self._queue.append((samples, size))
             self._queue_bytes += size
             self._queue_count += len(samples)
             self._queue_peak = max(self._queue_peak, self._queue_bytes)
             self._wake.notify()
-
-    def _fitting(self, samples: list[Sample]) -> tuple[list[Sample], int]:
-        room = self.options.queue_bytes - self._queue_bytes
-        size = 0
-        for count, sample in enumerate(samples):
-            needed = len(sample[2]) + SAMPLE_OVERHEAD_BYTES
-            if size + needed > room:
-                self._dropped_queue += len(samples) - count
-                return samples[:count], size
-            size += needed
-        return samples, size
 
     # --- called by anyone -------------------------------------------------------------------------------------------
 
@@ -169,9 +150,13 @@ class Recording:
         with self._wake:
             number = self._topic_count
             self._topic_count += 1
-            self._queue.append(lambda: self._announce(topic))
-            self._wake.notify()
+            self._enqueue(lambda: self._announce(topic))
         return number
+
+    def add_custom_data(self, values: Mapping[str, str]) -> None:
+        """Add to the metadata of this bag and the following ones; does not wait."""
+        with self._wake:
+            self._enqueue(lambda: self._add_custom_data(values))
 
     def start(self) -> Path:
         """Begin a bag; returns its path.
@@ -195,12 +180,6 @@ class Recording:
         """Write the messages of the last `snapshot_s` seconds to a bag of their own; returns its path."""
         return self._call(self._snapshot)
 
-    def add_custom_data(self, values: Mapping[str, str]) -> None:
-        """Add to the metadata of this bag and the following ones; does not wait."""
-        with self._wake:
-            self._queue.append(lambda: self._add_custom_data(values))
-            self._wake.notify()
-
     def close(self) -> None:
         """Write what is queued, close the bag if there is one, end the thread.
 
@@ -223,35 +202,45 @@ class Recording:
     def status(self) -> RecordingStatus:
         """Counts and state now."""
         with self._wake:
-            until = self._on_disk_until
-            return self._status._replace(
-                disk_behind_s=0.0 if until is None else time.monotonic() - until,
+            writer, last, until = self._writer, self._last, self._on_disk_until
+            written = writer.message_count if writer else 0
+            return RecordingStatus(
+                state=self._state,
+                path=str(last.path) if last else "",
+                written=self._written_before + written,
                 dropped_queue=self._dropped_queue,
-                pending=self._status.pending + self._queue_count,
+                dropped_size=self._dropped_size,
+                dropped_error=self._dropped_error,
+                pending=max(self._given - written, 0) + self._queue_count,
                 queue_bytes=self._queue_bytes,
                 queue_peak_bytes=self._queue_peak,
+                bytes_on_disk=last.size_bytes if last else 0,
+                files=last.file_count if last else 0,
+                disk_behind_s=0.0 if until is None else time.monotonic() - until,
+                error=self._error,
             )
 
     # --- the writing thread -----------------------------------------------------------------------------------------
+
+    def _enqueue(self, command: Callable[[], object]) -> None:
+        if self._closing:
+            raise BagError("the recorder is closing")
+        self._queue.append(command)
+        self._wake.notify()
 
     def _call[T](self, command: Callable[[], T]) -> T:
         future: Future[T] = Future()
 
         def run() -> None:
             try:
-                result = command()
-            except BagError as error:
-                self._publish()
+                future.set_result(command())
+            except Exception as error:  # noqa: BLE001 - whoever waits for the command gets it, and sees it in the status
+                if isinstance(error, WriteFailed) or not isinstance(error, BagError):
+                    self._fail(error)
                 future.set_exception(error)
-            else:
-                self._publish()  # whoever waits for the command sees its effect in the status
-                future.set_result(result)
 
         with self._wake:
-            if self._closing:
-                raise BagError("the recorder is closing")
-            self._queue.append(run)
-            self._wake.notify()
+            self._enqueue(run)
         return future.result()
 
     def _run(self) -> None:
@@ -262,102 +251,55 @@ class Recording:
                 item = self._queue.popleft() if self._queue else None
                 if item is None and self._closing:
                     return
+                if isinstance(item, tuple):
+                    self._queue_count -= len(item[0])
+                    self._queue_bytes -= item[1]
             try:
-                if callable(item):
-                    item()
+                if isinstance(item, tuple):
+                    self._take(*item)
                 elif item is not None:
-                    self._take(item)
-                if self._writer is not None and time.monotonic() - self._last_flush >= self.options.flush_period_s:
+                    item()
+                if self._writer is not None and time.monotonic() >= self._next_flush:
                     self._flush(self._writer)
             except Exception as error:  # noqa: BLE001 - a fault here must end as a failed recording, not in silence
-                self._give_up(error)
-            self._publish()
-
-    def _give_up(self, error: Exception) -> None:
-        self._error = f"internal error: {error!r}"
-        if self._writer is not None:
-            self._fail(self._writer, BagError(self._error))
-        self._state = FAILED
-        self.failed.set()
-
-    def _publish(self) -> None:
-        writer = self._writer
-        with self._wake:
-            self._status = self._status._replace(
-                state=self._state,
-                written=self._written_before + (writer.message_count if writer else 0),
-                dropped_size=self._dropped_size,
-                dropped_error=self._dropped_error,
-                pending=self._given - writer.message_count if writer else 0,
-                error=self._error,
-            )
-            if writer is not None:
-                self._status = self._status._replace(
-                    path=str(writer.path), bytes_on_disk=writer.size_bytes, files=writer.file_count
-                )
+                self._fail(error)
 
     def _until_flush(self) -> float | None:
-        if self._writer is None:
-            return None
-        return max(0.0, self._last_flush + self.options.flush_period_s - time.monotonic())
+        return max(0.0, self._next_flush - time.monotonic()) if self._writer is not None else None
 
-    def _take(self, samples: list[Sample]) -> None:
+    def _take(self, samples: list[Sample], size: int) -> None:
         if self.options.snapshot_s > 0.0:
-            self._remember(samples)
-        writer = self._writer
-        if writer is not None:
-            self._write(writer, samples)
-        elif self._state == FAILED:
-            self._dropped_error += len(samples)
-        with self._wake:
-            self._queue_count -= len(samples)
-            self._queue_bytes -= _size(samples)
-
-    def _write(self, writer: BagWriter, samples: Iterable[Sample]) -> None:
-        write = writer.write
-        remaining = iter(samples)
-        given = 0
-        try:
-            while True:
-                try:
-                    for sample in remaining:
-                        given += 1
-                        write(*sample)
-                    break
-                except MessageTooLarge as error:
-                    given -= 1
-                    self._dropped_size += 1
-                    self._error = str(error)
-            self._given += given
-        except BagError as error:
-            self._given += given
-            self._dropped_error += sum(1 for _ in remaining)
-            self._fail(writer, error)
+            self._remember(samples, size)
+        if self._writer is None:
+            self._dropped_error += len(samples) if self._state == FAILED else 0
+            return
+        self._given += len(samples)
+        write, remaining = self._writer.write, iter(samples)
+        while True:
+            try:
+                for number, log_ns, data, sent_ns, sequence in remaining:
+                    write(number, log_ns, data, sent_ns, sequence)
+                return
+            except MessageTooLarge as error:
+                self._given -= 1
+                self._dropped_size += 1
+                self._error = str(error)
 
     def _flush(self, writer: BagWriter) -> None:
-        self._last_flush = time.monotonic()
-        try:
-            writer.flush()
-            if self.options.sync:
-                self._sync(writer)
-        except BagError as error:
-            self._fail(writer, error)
-
-    def _sync(self, writer: BagWriter) -> None:
-        """Have the disk take what is in the file, in a thread of its own.
+        """Bring what was given into the file, and have the disk take it, in a thread of its own.
 
         What is in the file survives the recorder, and a slow disk must not keep the next data from getting there.
         """
-        if self._syncing is not None:
-            if not self._syncing.done():
-                return
-            error = self._syncing.exception()
-            self._syncing = None
-            if error is not None:
-                raise BagError(f"{writer.path}: the disk reports an error: {error}")
-        self._syncing = self._disk.submit(self._sync_and_close, writer.duplicate_descriptor(), time.monotonic())
+        self._next_flush = time.monotonic() + self.options.flush_period_s
+        writer.flush()
+        if not self.options.sync or (self._syncing is not None and not self._syncing.done()):
+            return
+        error = self._syncing.exception() if self._syncing is not None else None
+        if error is not None:
+            raise WriteFailed(f"{writer.path}: the disk reports an error: {error}")
+        self._syncing = self._disk.submit(self._sync, writer.duplicate_descriptor(), time.monotonic())
 
-    def _sync_and_close(self, descriptor: int, until: float) -> None:
+    def _sync(self, descriptor: int, until: float) -> None:
         """Run by the disk's thread: what was in the file at `until` is on the disk afterwards."""
         try:
             os.fdatasync(descriptor)
@@ -367,30 +309,36 @@ class Recording:
             if self._on_disk_until is not None:
                 self._on_disk_until = max(self._on_disk_until, until)
 
-    def _fail(self, writer: BagWriter, error: BagError) -> None:
-        with suppress(BagError):
-            writer.close()
-        self._dropped_error += self._given - writer.message_count
-        self._error = str(error)
-        self._leave(writer, FAILED)
+    def _fail(self, error: Exception) -> None:
+        """End the recording; what is in the file stays."""
+        writer = self._writer
+        if writer is not None:
+            with suppress(BagError):
+                writer.close()
+            self._dropped_error += self._given - writer.message_count
+            self._leave(writer)
+        self._error = str(error) if isinstance(error, BagError) else f"internal error: {error!r}"
+        self._state = FAILED
+        self._syncing = None
         self.failed.set()
 
-    def _leave(self, writer: BagWriter, state: str) -> None:
-        self._state = state
+    def _leave(self, writer: BagWriter) -> None:
         with self._wake:
+            self._state = STOPPED
             self._on_disk_until = None
-        self._publish()
-        self._written_before += writer.message_count
-        self._given = 0
-        self._writer = None
+            self._written_before += writer.message_count
+            self._given = 0
+            self._writer = None
 
     def _announce(self, topic: Topic) -> None:
         self._announced.append(topic)
         if self._writer is not None:
-            try:
-                self._writer.add_topic(topic)
-            except BagError as error:
-                self._fail(self._writer, error)
+            self._writer.add_topic(topic)
+
+    def _add_custom_data(self, values: Mapping[str, str]) -> None:
+        self._custom_data.update(values)
+        if self._writer is not None:
+            self._writer.set_custom_data(values)
 
     def _new_bag(self, path: Path) -> BagWriter:
         writer = BagWriter(path, self.options.writer, self._custom_data)
@@ -402,14 +350,16 @@ class Recording:
         if self._writer is not None:
             raise BagError(f"{self._writer.path}: is being recorded already")
         path = self.path if self._starts == 0 else _free_name(self.path, "", self._starts)
-        self._writer = self._new_bag(path)
+        try:
+            writer = self._new_bag(path)
+        except WriteFailed as error:
+            raise BagError(str(error)) from None  # nothing has begun that could fail
         self._starts += 1
-        self._state = RECORDING
-        self._error = ""
-        self._last_flush = time.monotonic()
-        if self.options.sync:
-            with self._wake:
-                self._on_disk_until = self._last_flush
+        self._next_flush = time.monotonic() + self.options.flush_period_s
+        with self._wake:
+            self._writer = self._last = writer
+            self._state, self._error = RECORDING, ""
+            self._on_disk_until = time.monotonic() if self.options.sync else None
         return path
 
     def _recorded(self) -> BagWriter:
@@ -419,53 +369,40 @@ class Recording:
 
     def _stop(self) -> Path:
         writer = self._recorded()
-        try:
-            writer.close()
-        except BagError as error:
-            self._fail(writer, error)
-            raise
-        self._leave(writer, STOPPED)
+        writer.close()
+        self._leave(writer)
         return writer.path
 
     def _split(self) -> Path:
         writer = self._recorded()
-        try:
-            writer.split()
-        except BagError as error:
-            self._fail(writer, error)
-            raise
+        writer.split()
         return writer.path
 
-    def _add_custom_data(self, values: Mapping[str, str]) -> None:
-        self._custom_data.update(values)
-        if self._writer is not None:
-            try:
-                self._writer.set_custom_data(values)
-            except BagError as error:
-                self._fail(self._writer, error)
-
-    def _remember(self, samples: list[Sample]) -> None:
+    def _remember(self, samples: list[Sample], size: int) -> None:
         memory = self._memory
         memory.extend(samples)
-        self._memory_bytes += _size(samples)
+        self._memory_bytes += size
         oldest = samples[-1][1] - int(self.options.snapshot_s * 1e9)
         while memory and (memory[0][1] < oldest or self._memory_bytes > self.options.snapshot_bytes):
-            self._memory_bytes -= len(memory.popleft()[2]) + SAMPLE_OVERHEAD_BYTES
+            self._memory_bytes -= _size([memory.popleft()])
 
     def _snapshot(self) -> Path:
         if self.options.snapshot_s <= 0.0:
             raise BagError("no messages are kept for a snapshot; set snapshot_s above 0")
         self._snapshots += 1
         path = _free_name(self.path, "snapshot_", self._snapshots)
-        with self._new_bag(path) as bag:
-            for sample in self._memory:
-                with suppress(MessageTooLarge):
-                    bag.write(*sample)
+        try:
+            with self._new_bag(path) as bag:
+                for sample in self._memory:
+                    with suppress(MessageTooLarge):
+                        bag.write(*sample)
+        except WriteFailed as error:
+            raise BagError(str(error)) from None  # the bag that is being recorded is another
         return path
 
 
 def _size(samples: Iterable[Sample]) -> int:
-    return sum(len(sample[2]) + SAMPLE_OVERHEAD_BYTES for sample in samples)
+    return sum(len(sample[2]) + MESSAGE_OVERHEAD_BYTES for sample in samples)
 
 
 def _free_name(path: Path, kind: str, number: int) -> Path:

@@ -15,9 +15,10 @@ import shutil
 import sqlite3
 import tempfile
 from collections import Counter
+from collections.abc import Iterable
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
@@ -25,7 +26,9 @@ from mcap.records import Attachment, Metadata
 from iwm_power_manager.bags.limits import ZSTD_MAGIC, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_file import McapFile
 from iwm_power_manager.bags.mcap_records import (
+    FIRST_PRIVATE,
     UNREADABLE,
+    ChannelMessage,
     Definitions,
     Record,
     read_record,
@@ -33,13 +36,11 @@ from iwm_power_manager.bags.mcap_records import (
     walk,
 )
 from iwm_power_manager.bags.mcap_source import McapSource
-from iwm_power_manager.bags.metadata import METADATA_FILE, FileSpan, Topic, text_values
-from iwm_power_manager.bags.reader import COMPRESSED_SUFFIX, SUFFIXES, BagReader, data_files, open_source
+from iwm_power_manager.bags.metadata import FileSpan, Topic, text_values
+from iwm_power_manager.bags.reader import COMPRESSED_SUFFIX, SUFFIXES, BagReader, Source, data_files, open_source
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.files import sync_folder
-
-_FIRST_PRIVATE = 0x80
 
 
 class FileRecovery(NamedTuple):
@@ -126,40 +127,43 @@ def recover(path: Path | str) -> Recovery:
         There is no such bag, nothing in it can be read, or there is no room for the rebuilt file.
     """
     path = Path(path)
-    if not path.exists():
-        raise BagError(f"{path}: does not exist")
+    folder = path if path.is_dir() else None
     with ExitStack() as stack:
         files: list[_File] = []
-        reports: list[FileRecovery] = []
+        left_out: list[FileRecovery] = []
         for name in _names(path):
             try:
-                regular_file(name, path if path.is_dir() else None)
+                regular_file(name, folder)
                 files.append(_File(name, stack))
             except BagError as error:
-                reports.append(FileRecovery(name.name, False, 0, str(error)))
+                left_out.append(FileRecovery(name.name, False, 0, str(error)))
         if not files:
-            raise BagError(f"{reports[0].damage}; nothing to recover")
-        valid = path.is_dir() and not reports and _is_valid(path)
+            raise BagError(f"{left_out[0].damage}; nothing to recover")
+        recorded = _recorded(path) if folder and not left_out else None
         sqlite = all(file.is_sqlite and not file.problem for file in files)
         for file in files:
-            if file.problem or (file.is_sqlite and not sqlite) or (file.is_compressed and not valid):
+            if file.problem or (file.is_sqlite and not sqlite) or (file.is_compressed and recorded is None):
                 file.rebuild()
         for file in files:
             file.put_in_place()
-        stale = path.is_dir() and (not valid or any(file.report.rebuilt for file in files))
+        stale = folder is not None and (recorded is None or any(file.report.rebuilt for file in files))
         if stale:
             _write_metadata(path, files, "sqlite3" if sqlite else "mcap")
-        missing: Counter[str] = Counter()
-        last: dict[str, int] = {}
-        for file in files:
-            missing.update(file.seen.missing(last))
         spans = [file.seen.span for file in files if file.seen.count]
-        start_ns, end_ns = min((span[0] for span in spans), default=0), max((span[1] for span in spans), default=0)
-        return Recovery(path, [file.report for file in files] + reports, dict(missing), start_ns, end_ns, stale)
+        return Recovery(
+            path,
+            [file.report for file in files] + left_out,
+            _missing(files),
+            min((start_ns for start_ns, _ in spans), default=0),
+            max((end_ns for _, end_ns in spans), default=0),
+            stale,
+        )
 
 
 def _names(path: Path) -> list[Path]:
     """Data files; not those of which an earlier recovery has left its result beside them."""
+    if not os.path.exists(path):
+        raise BagError(f"{path}: does not exist")
     if not path.is_dir():
         if not path.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES):
             raise BagError(f"{path}: is no folder and no .mcap or .db3 file")
@@ -176,14 +180,14 @@ def _target(path: Path) -> Path:
     return path.with_name(path.name.removesuffix(COMPRESSED_SUFFIX)).with_suffix(".mcap")
 
 
-def _is_valid(folder: Path) -> bool:
-    """Whether the metadata is there, makes sense, and speaks of all files that are."""
+def _recorded(folder: Path) -> dict[str, object] | None:
+    """What a bag's metadata says; None if it is missing, makes no sense, or speaks of other files than there are."""
     try:
         with BagReader(folder) as bag:
             listed = {str(name).rpartition("/")[2] for name in bag.information.get("relative_file_paths") or []}
-            return not bag.damage and listed == {name.name for name in _names(folder)}
+            return bag.information if not bag.damage and listed == {name.name for name in _names(folder)} else None
     except BagError:
-        return False
+        return None
 
 
 class _Seen:
@@ -192,39 +196,30 @@ class _Seen:
     Attributes
     ----------
     source : the file
-    count, span : messages, and the log times of the first and the last
-    topics : each topic with the number of its messages
+    counts, count, span : messages by channel and in all, and the log times of the first and the last
+    numbers : by topic the publisher's first and last number, and how many are left out in between
     compressed : the messages are compressed one by one
     """
 
-    def __init__(self, source: Any) -> None:
+    def __init__(self, source: Source) -> None:
         self.source = source
-        counts: Counter[int] = Counter()
-        self._numbers: list[tuple[int, int]] = []
+        self.counts: Counter[int] = Counter()
         self.compressed = False
         start_ns, end_ns = 2**64, 0
-        own = is_own(source)
-        for log_time, channel, data, _, sequence, _ in source.messages():
-            counts[channel] += 1
+        numbers: dict[int, list[int]] = {}
+        own = is_own(source)  # other recorders count something else
+        for log_time, channel, data, _, sequence in source.messages():
+            self.counts[channel] += 1
             start_ns, end_ns = min(start_ns, log_time), max(end_ns, log_time)
-            if sequence and own:  # other recorders count something else
-                self._numbers.append((channel, sequence))
             self.compressed = self.compressed or data[:4] == ZSTD_MAGIC
-        self.count = counts.total()
+            if sequence and own:
+                known = numbers.setdefault(channel, [sequence, sequence, 0])
+                known[2] += max(sequence - known[1] - 1, 0)
+                known[1] = sequence
+        self.count = self.counts.total()
         self.span = (start_ns, end_ns) if self.count else (0, 0)
-        self.topics: list[tuple[Topic, int]] = [(topic, counts[number]) for number, topic in source.topics().items()]
-
-    def missing(self, last: dict[str, int]) -> Counter[str]:
-        """By topic, numbers left out; `last` holds each topic's last number of the files before, and is brought on."""
-        found: Counter[str] = Counter()
-        names = {number: topic.name for number, topic in self.source.topics().items()}
-        for channel, number in self._numbers:
-            name = names.get(channel, "")
-            before = last.get(name, 0)
-            if before and number > before + 1:
-                found[name] += number - before - 1
-            last[name] = number
-        return found
+        self.topics = source.topics()
+        self.numbers = {self.topics[number].name: known for number, known in numbers.items() if number in self.topics}
 
 
 class _File:
@@ -252,12 +247,12 @@ class _File:
 
     def rebuild(self) -> None:
         """Write what can be read to a file of its own, and read that."""
-        source, target = self.seen.source, _target(self.path)
+        target = _target(self.path)
         temporary = target.with_name(target.name + ".recovering")
         try:
             temporary.unlink(missing_ok=True)
             self._stack.callback(temporary.unlink, missing_ok=True)
-            copy = _Copy(source, temporary)
+            copy = _Copy(self.seen.source, temporary)
             made = _Seen(open_source(temporary, self._stack, ".mcap"))
         except OSError as error:
             raise BagError(f"{temporary}: cannot be written: {error.strerror or error}") from None
@@ -276,35 +271,23 @@ class _File:
         """Let the rebuilt file take its place."""
         if self._temporary is None:
             return
-        keep = self.path.with_name(self.report.kept) if self.report.kept.endswith(".damaged") else None
         try:
-            if keep is not None:
+            if self.report.kept.endswith(".damaged"):
+                keep = self.path.with_name(self.report.kept)
                 keep.unlink(missing_ok=True)
-                _second_name(self.path, keep)
+                try:
+                    os.link(self.path, keep)
+                except OSError:  # a file system without links
+                    shutil.copy2(self.path, keep)
             os.replace(self._temporary, self.path)
             sync_folder(self.path.parent)
         except OSError as error:
             raise BagError(f"{self._temporary}: cannot be written: {error.strerror or error}") from None
 
-    def distro(self) -> str:
-        """ROS distribution as the file knows it; "" for this one, in a file of this project."""
-        source = self.seen.source
-        if not isinstance(source, McapSource):
-            return ""
-        known = source.information().get("ros_distro") or source.metadata.get("rosbag2", {}).get("ROS_DISTRO")
-        return str(known or ("" if is_own(source) else "unknown"))
 
-
-def _second_name(path: Path, other: Path) -> None:
-    try:
-        os.link(path, other)
-    except OSError:  # a file system without links
-        shutil.copy2(path, other)
-
-
-def is_own(source: Any) -> bool:
+def is_own(source: Source) -> bool:
     """Whether this project's recorder has written a file."""
-    return isinstance(source, McapSource) and source.header().library.startswith(LIBRARY.partition(" ")[0])
+    return source.header.library.startswith(LIBRARY.partition(" ")[0])
 
 
 def _opened(path: Path, stack: ExitStack) -> tuple[Path, str]:
@@ -336,16 +319,14 @@ class _Copy:
     torn : bytes at the end that hold no whole record
     """
 
-    def __init__(self, source: Any, target: Path) -> None:
+    def __init__(self, source: Source, target: Path) -> None:
         self.lost = 0
         self.torn = 0
-        self._source = source
-        profile = source.header().profile if isinstance(source, McapSource) else "ros2"
-        library = source.header().library if isinstance(source, McapSource) else LIBRARY
-        self._file = McapFile(target, library=library or LIBRARY, profile=profile)
+        self._channels: dict[int, int] = {}  # by the numbers of the old file those of the new one
+        self._file = McapFile(target, library=source.header.library or LIBRARY, profile=source.header.profile)
         try:
             if isinstance(source, McapSource):
-                self._channels = self._announced(source)
+                self._announce(source.definitions)
                 for record in walk(source.data):
                     self._take(source, record)
             else:
@@ -356,68 +337,86 @@ class _Copy:
             self._file.abandon()
             raise
 
-    def _announced(self, source: McapSource) -> dict[int, int]:
-        """All channels with their schemas; the numbers they have in the new file."""
-        definitions, channels = source.definitions, {}
+    def _announce(self, definitions: Definitions) -> None:
+        """All channels with their schemas, as they were."""
         for number, channel in definitions.channels.items():
             schema = definitions.schema_of(channel)
             schema_id = self._file.schema_id(schema.name, schema.encoding, schema.data) if schema.id else 0
-            channels[number] = self._file.add_channel(
-                channel.topic, schema_id, channel.metadata, channel.message_encoding
+            self._channels[number] = self._file.writer.register_channel(
+                channel.topic, channel.message_encoding, schema_id, channel.metadata
             )
-        return channels
 
     def _take(self, source: McapSource, record: Record) -> None:
+        data, writer = source.data, self._file.writer
         if record.opcode == Opcode.CHUNK:
             try:
-                self._write(split(source.raw(record.start, record.end), Definitions()))
+                self._write(split(source.raw(record), Definitions()))
             except BagError:
                 self.lost += 1
         elif record.opcode == Opcode.MESSAGE:
-            self._write(split(source.data[record.start : record.end], Definitions()))
+            self._write(split(data[record.start : record.end], Definitions()))
         elif record.opcode == Opcode.ATTACHMENT:
-            found = read_record(Attachment, source.body(record))
-            self._file.add_attachment(found)
+            found: Attachment = read_record(Attachment, data, record)
+            writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
         elif record.opcode == Opcode.METADATA:
-            metadata = read_record(Metadata, source.body(record))
-            self._file.add_metadata(metadata.name, metadata.metadata)
-        elif record.opcode >= _FIRST_PRIVATE:
-            self._file.add_record(bytes(source.data[record.start : record.end]))
-        elif record.opcode == UNREADABLE and record.end < len(source.data):
+            metadata: Metadata = read_record(Metadata, data, record)
+            writer.add_metadata(metadata.name, metadata.metadata)
+        elif record.opcode >= FIRST_PRIVATE:
+            self._file.add_record(data[record.start : record.end])
+        elif record.opcode == UNREADABLE and record.end < len(data):
             self.lost += 1
         elif record.opcode == UNREADABLE:
             self.torn = record.end - record.start
+        self._file.push()
 
-    def _write(self, messages: Any) -> None:
-        for log_time, channel, data, publish_time, sequence, _ in messages:
+    def _write(self, messages: Iterable[ChannelMessage]) -> None:
+        writer = self._file.writer
+        for log_time, channel, data, publish_time, sequence in messages:
             if channel not in self._channels:  # its announcement is lost; what was sent on it is not
-                self._channels[channel] = self._file.add_channel(f"/recovered/channel_{channel}", 0, {})
-            self._file.write(self._channels[channel], log_time, publish_time, sequence, data)
+                self._channels[channel] = writer.register_channel(f"/recovered/channel_{channel}", "cdr", 0, {})
+            writer.add_message(self._channels[channel], log_time, data, publish_time, sequence)
+            if self._file.pieces:
+                self._file.push()
+
+
+def _missing(files: Iterable[_File]) -> dict[str, int]:
+    """By topic, the publisher's numbers left out in files and between them."""
+    found: Counter[str] = Counter()
+    last: dict[str, int] = {}
+    for file in files:
+        for topic, (first, end, left_out) in file.seen.numbers.items():
+            found[topic] += left_out + max(first - last.get(topic, first) - 1, 0)
+            last[topic] = end
+    return dict(+found)
 
 
 def _write_metadata(folder: Path, files: list[_File], storage: str) -> None:
     """`metadata.yaml` of the whole bag, with what the old one or the files know of it."""
-    recorded: dict[str, Any] = {}
-    if (folder / METADATA_FILE).is_file():
-        try:
-            with BagReader(folder) as bag:
-                recorded = bag.information
-        except BagError:
-            pass  # what it says may still be read from the files
+    recorded: dict[str, object] = {}
+    try:
+        with BagReader(folder) as bag:
+            recorded = bag.information
+    except BagError:
+        pass  # what it says may still be read from the files
     topics: dict[str, Topic] = {}
     counts: Counter[str] = Counter()
     custom_data: dict[str, str] = {}
+    distro = str(recorded.get("ros_distro") or "")
     for file in files:
-        custom_data.update(file.seen.source.custom_data())
-        for topic, count in file.seen.topics:
+        source = file.seen.source
+        custom_data.update(source.custom_data())
+        if isinstance(source, McapSource):  # "" is this one
+            known = source.information().get("ros_distro") or source.metadata.get("rosbag2", {}).get("ROS_DISTRO")
+            distro = distro or str(known or ("" if is_own(source) else "unknown"))
+        for number, topic in file.seen.topics.items():
             topics.setdefault(topic.name, topic)
-            counts[topic.name] += count
+            counts[topic.name] += file.seen.counts[number]
     write_metadata(
         folder,
         [FileSpan(file.path.name, *file.seen.span, file.seen.count) for file in files],
         [(topic, counts[name]) for name, topic in topics.items()],
         custom_data | text_values(recorded.get("custom_data")),
         storage=storage,
-        distro=str(recorded.get("ros_distro") or next(filter(None, (file.distro() for file in files)), "")),
+        distro=distro,
         compression="zstd" if any(file.seen.compressed for file in files) else "",
     )

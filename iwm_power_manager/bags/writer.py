@@ -8,8 +8,8 @@ each file carries every schema and the custom metadata, so that each can be read
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -23,15 +23,13 @@ from iwm_power_manager.bags.metadata import (
     FileSpan,
     Topic,
     bag_information,
-    information_text,
-    metadata_text,
-    qos_text,
+    qos_entries,
+    yaml_text,
 )
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.files import atomic_write, sync_folder
 
 LIBRARY = f"iwm_power_manager {__version__}"
-DEFAULT_CHUNK_BYTES = 786_432
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class WriterOptions:
     """
 
     compression: str = "zstd"
-    chunk_bytes: int = DEFAULT_CHUNK_BYTES
+    chunk_bytes: int = 786_432
     max_bytes: int = 0
     max_duration_ns: int = 0
     max_message_bytes: int = 64 * 1024 * 1024
@@ -66,6 +64,10 @@ class MessageTooLarge(BagError):
     """A message is larger than `WriterOptions.max_message_bytes`; it was not written, the bag is unharmed."""
 
 
+class WriteFailed(BagError):
+    """The disk is full, the folder is gone or the like: close the bag, which keeps what was written."""
+
+
 class BagWriter:
     """A new rosbag2 bag.
 
@@ -78,8 +80,9 @@ class BagWriter:
     Raises
     ------
     BagError
-        The folder exists or cannot be written. Later, from every writing method: the disk is full, the folder is gone
-        or the like; then close the bag, which keeps what was written.
+        The folder exists or cannot be created.
+    WriteFailed
+        From every method that writes.
     """
 
     def __init__(
@@ -92,14 +95,12 @@ class BagWriter:
         self._counts: list[int] = []
         self._channels: list[int] = []
         self._spans: list[FileSpan] = []
-        self._largest = self.options.max_message_bytes
-        self._splits = self.options.max_bytes > 0 or self.options.max_duration_ns > 0
-        self._pending_bytes = 0  # in memory, since the file had
-        self._pending_of = 0  # so many bytes
-        self._file_start_ns = 0
-        self._file_has_message = False
         self._closed = False
         self._closed_bytes = 0
+        self._largest = self.options.max_message_bytes
+        self._splits = self.options.max_bytes > 0 or self.options.max_duration_ns > 0
+        self._fill = (0, 0)  # how large the file was, and what has been given to it since
+        self._file_start_ns: int | None = None  # log time of its first message
         self._file: McapFile | None = None  # none once the bag is closed, or if the next file could not be opened
         try:
             _make_folder(self.path)
@@ -139,19 +140,16 @@ class BagWriter:
         """Announce a topic; returns the number that `write` takes."""
         self._topics.append(topic)
         self._counts.append(0)
-        try:
+        with self._failing():
             self._channels.append(announce(self._open, topic))
-        except OSError as error:
-            raise self._failed(error) from None
         return len(self._topics) - 1
 
     def set_custom_data(self, values: Mapping[str, str]) -> None:
-        """Add to the custom metadata, on disk at once."""
+        """Add to the custom metadata, in the file at once."""
         self.custom_data.update(values)
-        try:
-            self._open.add_metadata(CUSTOM_METADATA, dict(values))
-        except OSError as error:
-            raise self._failed(error) from None
+        with self._failing():
+            self._open.writer.add_metadata(CUSTOM_METADATA, dict(values))
+            self._open.push()
 
     def write(
         self, topic: int, log_time_ns: int, data: bytes, publish_time_ns: int | None = None, sequence: int = 0
@@ -166,51 +164,38 @@ class BagWriter:
         publish_time_ns : when it was sent; None for the log time
         sequence : the publisher's counter, 0 if unknown
         """
-        file = self._file
-        if len(data) > self._largest or self._splits or not self._file_has_message or file is None:
-            file = self._prepared(topic, log_time_ns, len(data))
-        try:
-            file.write(
-                self._channels[topic],
-                log_time_ns,
-                log_time_ns if publish_time_ns is None else publish_time_ns,
-                sequence & 0xFFFFFFFF,
-                data,
-            )
-        except OSError as error:
-            raise self._failed(error) from None
+        if self._splits or self._file_start_ns is None or len(data) > self._largest:
+            self._prepare(topic, log_time_ns, len(data))
+        if publish_time_ns is None:
+            publish_time_ns = log_time_ns
+        self._add(self._channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
+        if self._pieces:  # a chunk is full
+            with self._failing():
+                self._open.push()
 
-    def _prepared(self, topic: int, log_time_ns: int, size: int) -> McapFile:
-        """The file for a message of this size, if it is not too large."""
+    def _prepare(self, topic: int, log_time_ns: int, size: int) -> None:
+        """Refuse a message that is too large; begin the next file, if the present one is full or old enough."""
+        options, file = self.options, self._open
         if size > self._largest:
             raise MessageTooLarge(
                 f"{self.path}: {self._topics[topic].name}: a message of {size} bytes was not written; "
                 f"allowed: <= {self._largest}"
             )
-        self._split_if_due(log_time_ns, size)
-        return self._open
-
-    def _split_if_due(self, log_time_ns: int, size: int) -> None:
-        """Begin the next file, if the present one is full or old enough."""
-        options, file = self.options, self._open
-        if self._file_has_message and (
+        given = self._fill[1] if self._fill[0] == file.size_bytes else 0
+        if self._file_start_ns is not None and (
             0 < options.max_duration_ns <= log_time_ns - self._file_start_ns
-            or 0 < options.max_bytes < file.size_bytes + self._pending_bytes + size
+            or 0 < options.max_bytes < file.size_bytes + given + size
         ):
             self.split()
-        if self._pending_of != file.size_bytes:  # a chunk has gone into the file
-            self._pending_of, self._pending_bytes = file.size_bytes, 0
-        self._pending_bytes += MESSAGE_OVERHEAD_BYTES + size
-        if not self._file_has_message:
+            file, given = self._open, 0
+        self._fill = (file.size_bytes, given + MESSAGE_OVERHEAD_BYTES + size)
+        if self._file_start_ns is None:
             self._file_start_ns = log_time_ns
-            self._file_has_message = True
 
     def flush(self, sync: bool = False) -> None:
         """Bring everything given so far into the file; with `sync` onto the disk."""
-        try:
+        with self._failing():
             self._open.flush(sync)
-        except OSError as error:
-            raise self._failed(error) from None
 
     def duplicate_descriptor(self) -> int:
         """A descriptor of the current file, for whoever wants to wait for the disk; theirs to close."""
@@ -218,10 +203,9 @@ class BagWriter:
 
     def split(self) -> None:
         """Close the current file and begin the next."""
-        if not self._file_has_message:
-            return
-        self._finish_file(self._open)
-        self._open_file()
+        if self._file_start_ns is not None:
+            self._finish_file(self._open)
+            self._open_file()
 
     def close(self) -> None:
         """Close the file and write `metadata.yaml`. Closing twice does nothing."""
@@ -232,7 +216,8 @@ class BagWriter:
             if self._file is not None:
                 self._finish_file(self._file)
         finally:
-            self._write_metadata()
+            topics = list(zip(self._topics, self._counts, strict=True))
+            write_metadata(self.path, self._spans, topics, self.custom_data)
 
     def abandon(self) -> None:
         """Close without index and metadata, as a crash would leave the bag (see `recover`)."""
@@ -241,20 +226,25 @@ class BagWriter:
             self._file.abandon()
             self._file = None
 
-    def _file_name(self) -> str:
-        return f"{self.path.name}_{len(self._spans)}.mcap"
-
     @property
     def _open(self) -> McapFile:
         if self._file is None:
-            raise BagError(f"{self.path}: is closed, or its next file could not be created")
+            raise WriteFailed(f"{self.path}: is closed, or its next file could not be created")
         return self._file
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        """What the disk says as what this bag says."""
+        try:
+            yield
+        except OSError as error:
+            raise WriteFailed(f"{self.path}: cannot be written: {error.strerror or os.fspath(self.path)}") from None
 
     def _open_file(self) -> None:
         """Begin the next file; one that cannot take its definitions is removed again."""
-        try:
+        with self._failing():
             file = McapFile(
-                self.path / self._file_name(),
+                self.path / f"{self.path.name}_{len(self._spans)}.mcap",
                 library=LIBRARY,
                 compression=self.options.compression,
                 chunk_bytes=self.options.chunk_bytes,
@@ -262,38 +252,29 @@ class BagWriter:
             try:
                 sync_folder(self.path)
                 if self.custom_data:
-                    file.add_metadata(CUSTOM_METADATA, self.custom_data)
+                    file.writer.add_metadata(CUSTOM_METADATA, self.custom_data)
                 self._channels = [announce(file, topic) for topic in self._topics]
+                file.push()
             except OSError:
                 file.remove()
                 raise
-        except OSError as error:
-            raise self._failed(error) from None
-        self._file = file
-        self._file_has_message = False
+        self._file, self._file_start_ns = file, None
+        self._add, self._pieces = file.writer.add_message, file.pieces
 
     def _finish_file(self, file: McapFile) -> None:
         try:
-            if file.broken:
-                file.abandon()
-            else:
-                finish(file, list(zip(self._topics, self._channels, strict=True)), self.custom_data)
-        except OSError as error:
-            file.abandon()
-            raise self._failed(error) from None
+            with self._failing():
+                if file.broken:
+                    file.abandon()
+                else:
+                    finish(file, list(zip(self._topics, self._channels, strict=True)), self.custom_data)
         finally:
-            self._file = None
+            file.abandon()
+            self._file = self._file_start_ns = None
             for index, channel in enumerate(self._channels):
-                self._counts[index] += file.channel_counts.get(channel, 0)
+                self._counts[index] += file.counts[channel]
             self._spans.append(span_of(file))
             self._closed_bytes += file.size_bytes
-
-    def _write_metadata(self) -> None:
-        topics = list(zip(self._topics, self._counts, strict=True))
-        write_metadata(self.path, self._spans, topics, self.custom_data)
-
-    def _failed(self, error: OSError) -> BagError:
-        return BagError(f"{self.path}: cannot be written: {error.strerror or os.fspath(self.path)}")
 
 
 def _make_folder(path: Path) -> None:
@@ -308,16 +289,20 @@ def announce(file: McapFile, topic: Topic) -> int:
     """Write a topic's schema and channel into a file; returns the channel's id."""
     definition = topic.definition.encode("utf-8", "surrogateescape")
     schema = file.schema_id(topic.type, topic.encoding, definition) if definition else 0
-    metadata = {"offered_qos_profiles": qos_text(topic.qos), "topic_type_hash": topic.type_hash}
-    return file.add_channel(topic.name, schema, metadata, topic.serialization)
+    qos = yaml_text(qos_entries(topic.qos)) if topic.qos else ""
+    metadata = {"offered_qos_profiles": qos, "topic_type_hash": topic.type_hash}
+    channel = file.writer.register_channel(topic.name, topic.serialization, schema, metadata)
+    if file.pieces:  # that has closed a chunk
+        file.push()
+    return channel
 
 
 def finish(file: McapFile, channels: Sequence[tuple[Topic, int]], custom_data: Mapping[str, str]) -> None:
     """Complete a file with the metadata rosbag2 keeps inside, and close it."""
     file.flush()
-    counts = [(topic, file.channel_counts[channel]) for topic, channel in channels]
+    counts = [(topic, file.counts[channel]) for topic, channel in channels]
     information = bag_information("mcap", [span_of(file)], counts, custom_data)
-    file.add_metadata("rosbag2", {"serialized_metadata": information_text(information)})
+    file.writer.add_metadata("rosbag2", {"serialized_metadata": yaml_text(information)})
     file.finish()
 
 
@@ -336,9 +321,9 @@ def write_metadata(
     distro: str = "",
     compression: str = "",
 ) -> None:
-    """Write a bag's `metadata.yaml`; `BagError` if it cannot be. Arguments as of `metadata.bag_information`."""
+    """Write a bag's `metadata.yaml`; `WriteFailed` if it cannot be. Arguments as of `metadata.bag_information`."""
     information = bag_information(storage, spans, topics, custom_data, distro=distro, compression=compression)
     try:
-        atomic_write(folder / METADATA_FILE, metadata_text(information).encode())
+        atomic_write(folder / METADATA_FILE, yaml_text({"rosbag2_bagfile_information": information}).encode())
     except ConfigError as error:
-        raise BagError(str(error)) from None
+        raise WriteFailed(str(error)) from None

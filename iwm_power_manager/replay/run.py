@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from iwm_power_manager.bags.metadata import Qos, Topic
+from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS
@@ -261,7 +261,8 @@ class ReplayOutput:
         self._numbers = []
         for kind in COMPUTED:
             name = topic_named(kind, bag.topics)
-            topic = bag.topics[name] if name is not None else Topic(f"/{kind}", *_joint_state_type(), (Qos(depth=100),))
+            new = Topic(f"/{kind}", JOINT_STATE, *definition_of(JOINT_STATE), (DEFAULT_QOS._replace(depth=100),))
+            topic = bag.topics[name] if name is not None else new
             self._numbers.append(writer.add_topic(topic))
         self._wheels = joint_state_writer(plan.wheel_names, "effort")
         self._state = joint_state_writer(SIGNAL_NAMES, "position")
@@ -302,7 +303,3 @@ def _with_messages(bag: BagReader, topic: str | None) -> str | None:
     if bag.counts:
         return topic if bag.counts.get(topic) else None
     return topic if any(message.topic == topic for message in bag.messages()) else None
-
-
-def _joint_state_type() -> tuple[str, str, str]:
-    return (JOINT_STATE, *definition_of(JOINT_STATE))

@@ -20,6 +20,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rosbags.interfaces import QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 
 from iwm_power_manager.bags.reader import BagReader, Message
@@ -213,8 +214,8 @@ def _publisher(node: Node, bag: BagReader, name: str) -> Any:
         msg_class = getattr(importlib.import_module(f"{package}.msg"), rest.rpartition("/")[2])
     except (ImportError, AttributeError, ValueError):
         raise BagError(f"type {topic.type} is not installed here") from None
-    reliable = not topic.qos or any(profile.reliability != "best_effort" for profile in topic.qos)
-    latched = any(profile.durability == "transient_local" for profile in topic.qos)
+    reliable = not topic.qos or any(profile.reliability is not QosReliability.BEST_EFFORT for profile in topic.qos)
+    latched = any(profile.durability is QosDurability.TRANSIENT_LOCAL for profile in topic.qos)
     profile = QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=_DEPTH,

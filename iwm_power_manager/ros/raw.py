@@ -18,11 +18,13 @@ from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
 from typing import Any, NamedTuple
 
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-from iwm_power_manager.bags.metadata import INFINITE_NS, Qos
+from iwm_power_manager.bags.metadata import INFINITE
 from iwm_power_manager.ros.intake import Unattended, never_called
 
 #: One message as it was taken: topic number, received (ns), bytes, sent (ns), the publisher's counter.
@@ -246,19 +248,17 @@ def _node_names(publishers: Sequence[TopicEndpointInfo]) -> set[str]:
 
 
 def _offered(profile: QoSProfile) -> Qos:
-    def name(policy: Any) -> str:
-        return str(policy.name).lower()
-
-    def nanoseconds(duration: Any) -> int:
-        return min(int(duration.nanoseconds), INFINITE_NS)
+    def time(duration: Duration) -> QosTime:
+        return min(QosTime(*divmod(int(duration.nanoseconds), 1_000_000_000)), INFINITE)
 
     return Qos(
-        name(profile.history),
+        QosHistory[profile.history.name],
         profile.depth,
-        name(profile.reliability),
-        name(profile.durability),
-        nanoseconds(profile.deadline),
-        nanoseconds(profile.lifespan),
-        name(profile.liveliness),
-        nanoseconds(profile.liveliness_lease_duration),
+        QosReliability[profile.reliability.name],
+        QosDurability[profile.durability.name],
+        time(profile.deadline),
+        time(profile.lifespan),
+        QosLiveliness[profile.liveliness.name],
+        time(profile.liveliness_lease_duration),
+        False,
     )

@@ -66,7 +66,7 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_or_may_is_damage(
     path = with_chunk(tmp_path / "a.mcap", compression, zeros(compression, 64 * 2**20 + 1), stated)
     count, damage = contents(path)
     assert count == 15
-    assert "the chunk at byte" in damage[0]
+    assert any("the chunk at byte" in line for line in damage)
 
 
 def test_a_frame_that_says_gigabytes_allocates_none(tmp_path: Path) -> None:

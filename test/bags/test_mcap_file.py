@@ -17,16 +17,17 @@ from iwm_power_manager.bags.recover import recover
 def fill(path: Path, count: int, **options: object) -> McapFile:
     file = McapFile(path, library="test", **options)  # type: ignore[arg-type]
     schema = file.schema_id("pkg/msg/A", "ros2msg", b"float64 data")
-    channels = [file.add_channel(f"/t{i}", schema, {"key": "value"}) for i in range(3)]
+    channels = [file.writer.register_channel(f"/t{i}", "cdr", schema, {"key": "value"}) for i in range(3)]
     for i in range(count):
-        file.write(channels[i % 3], 1000 + i, 900 + i, i, bytes([i % 256]) * (i % 50))
+        file.writer.add_message(channels[i % 3], 1000 + i, bytes([i % 256]) * (i % 50), 900 + i, i)
+    file.push()
     return file
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_a_finished_file_holds_every_message_with_valid_checksums_and_index(tmp_path: Path, compression: str) -> None:
     file = fill(tmp_path / "a.mcap", 2000, compression=compression, chunk_bytes=4096)
-    file.add_metadata("extra", {"a": "1", "b": ""})
+    file.writer.add_metadata("extra", {"a": "1", "b": ""})
     file.finish()
     with (tmp_path / "a.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
@@ -55,9 +56,9 @@ def test_a_finished_file_holds_every_message_with_valid_checksums_and_index(tmp_
 
 def test_log_times_out_of_order_are_found_by_the_index(tmp_path: Path) -> None:
     file = McapFile(tmp_path / "a.mcap", library="test")
-    channel = file.add_channel("/t", 0, {})
+    channel = file.writer.register_channel("/t", "cdr", 0)
     for time_ns in (5, 3, 9, 1, 7):
-        file.write(channel, time_ns, time_ns, 0, b"x")
+        file.writer.add_message(channel, time_ns, b"x", time_ns)
     file.finish()
     with (tmp_path / "a.mcap").open("rb") as stream:
         assert [m.log_time for _, _, m in make_reader(stream).iter_messages()] == [1, 3, 5, 7, 9]
@@ -74,9 +75,9 @@ def test_a_file_without_messages_is_valid(tmp_path: Path) -> None:
 
 def test_everything_flushed_is_readable_from_the_unfinished_file(tmp_path: Path) -> None:
     file = fill(tmp_path / "a.mcap", 500)
-    assert file.pending_count == 500
+    assert file.message_count == 0
     file.flush(sync=True)
-    assert (file.pending_count, file.message_count) == (0, 500)
+    assert (file.message_count, file.start_time_ns, file.end_time_ns) == (500, 1000, 1499)
     with (tmp_path / "a.mcap").open("rb") as stream:
         count = 0
         with pytest.raises(Exception, match=r".*"):  # mcap has several for a missing end
@@ -118,13 +119,13 @@ def test_a_half_written_chunk_is_cut_off_and_what_was_written_before_is_whole(
 
     monkeypatch.setattr(file, "_stream", FullDisk())
     for i in range(100):
-        file.write(1, 5000 + i, 0, 0, bytes(range(100)))
+        file.writer.add_message(1, 5000 + i, bytes(range(100)), 0)
     with pytest.raises(OSError, match="No space left"):
         file.flush()
     monkeypatch.setattr(file, "_stream", stream)
     assert (file.message_count, file.broken) == (100, True)
     with pytest.raises(OSError, match="an earlier write has failed"):
-        file.write(1, 6000, 0, 0, b"")
+        file.push()
     file.abandon()
     assert (tmp_path / "a.mcap").stat().st_size == file.size_bytes
     report = recover(tmp_path / "a.mcap").files[0]
@@ -141,10 +142,12 @@ def test_a_file_removed_while_it_is_written_is_noticed_at_the_next_flush(tmp_pat
 
 def test_a_channel_that_closes_a_chunk_counts_no_message_that_is_still_in_memory(tmp_path: Path) -> None:
     file = McapFile(tmp_path / "a.mcap", library="test", chunk_bytes=200)
-    channel = file.add_channel("/a", 0, {})
-    file.write(channel, 1, 1, 1, bytes(60))
-    other = file.add_channel("/b" * 100, 0, {})
-    assert (file.message_count, file.pending_count) == (1, 0)
-    file.write(other, 2, 2, 1, b"")
-    assert (file.message_count, file.pending_count) == (1, 1)
+    channel = file.writer.register_channel("/a", "cdr", 0)
+    file.writer.add_message(channel, 1, bytes(60), 1)
+    other = file.writer.register_channel("/b" * 100, "cdr", 0)
+    file.push()
+    assert file.counts == {channel: 1}
+    file.writer.add_message(other, 2, b"", 2)
+    file.push()
+    assert file.counts == {channel: 1}
     file.abandon()

@@ -214,6 +214,7 @@ def test_qos_of_every_rosbag2_version_is_understood() -> None:
     numbers = "- history: 1\n  depth: 5\n  reliability: 2\n  durability: 1\n  deadline: {sec: 0, nsec: 7}\n"
     numbers += "  lifespan: {sec: 1, nsec: 0}\n  liveliness: 1\n  liveliness_lease_duration: {sec: 0, nsec: 0}\n"
     (profile,) = parse_qos(numbers)
-    assert (profile.history, profile.reliability, profile.durability) == ("keep_last", "best_effort", "transient_local")
-    assert (profile.depth, profile.deadline_ns, profile.lifespan_ns) == (5, 7, 1_000_000_000)
+    assert (profile.history.name, profile.reliability.name) == ("KEEP_LAST", "BEST_EFFORT")
+    assert profile.durability.name == "TRANSIENT_LOCAL"
+    assert (profile.depth, profile.deadline, profile.lifespan) == (5, (0, 7), (1, 0))
     assert parse_qos("") == parse_qos("nonsense") == parse_qos("[1, 2]") == parse_qos("{") == ()

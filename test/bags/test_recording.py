@@ -18,9 +18,10 @@ import pytest
 from bags_helpers import float64, topic
 from disk_helpers import on_small_disk, private_folder
 from iwm_power_manager.bags import recording as recording_module
+from iwm_power_manager.bags.limits import MESSAGE_OVERHEAD_BYTES as SAMPLE_OVERHEAD_BYTES
 from iwm_power_manager.bags.mcap_file import McapFile
 from iwm_power_manager.bags.reader import BagReader
-from iwm_power_manager.bags.recording import SAMPLE_OVERHEAD_BYTES, Recording, RecordingOptions, Sample
+from iwm_power_manager.bags.recording import Recording, RecordingOptions, Sample
 from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.bags.writer import WriterOptions
 from iwm_power_manager.errors import BagError

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import Reader
 from sensor_msgs.msg import JointState
 
 from bags_helpers import float64, topic
-from iwm_power_manager.bags.metadata import Qos, Topic
+from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter, MessageTooLarge, WriterOptions
 from iwm_power_manager.errors import BagError
@@ -176,7 +176,7 @@ def test_what_was_written_before_the_disk_was_full_stays_readable(tmp_path: Path
 
 def test_a_type_without_definition_is_still_recorded(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as bag:
-        number = bag.add_topic(Topic("/a", "other_msgs/msg/Thing", "", "", (Qos(),)))
+        number = bag.add_topic(Topic("/a", "other_msgs/msg/Thing", "", "", (DEFAULT_QOS,)))
         bag.write(number, 1, b"\0\1\0\0")
     with BagReader(tmp_path / "bag") as reader:
         assert [m.data for m in reader.messages()] == [b"\0\1\0\0"]

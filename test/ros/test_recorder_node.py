@@ -238,8 +238,8 @@ def test_latched_and_best_effort_publishers_are_met_with_their_own_qos(
     assert texts[0] == "before the recorder"
     assert texts[-1] == "newcomer"
     with BagReader(tmp_path / "bag") as reader:
-        assert reader.topics["/latched"].qos[0].durability == "transient_local"
-        assert reader.topics["/best_effort"].qos[0].reliability == "best_effort"
+        assert reader.topics["/latched"].qos[0].durability.name == "TRANSIENT_LOCAL"
+        assert reader.topics["/best_effort"].qos[0].reliability.name == "BEST_EFFORT"
 
 
 def test_services_start_split_stop_and_take_snapshots(
