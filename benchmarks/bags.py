@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ from iwm_power_manager.signals.types import definition_of, standard_types
 
 TWIST, FLOAT64 = "geometry_msgs/msg/TwistStamped", "std_msgs/msg/Float64"
 TOPICS = 5
-ROUNDS = 3
+ROUNDS = 7
 #: Messages the recorder's node hands over at a time: 20 ms of 5 topics at 1 kHz.
 BATCH = 100
 MESSAGES = [
@@ -72,18 +73,19 @@ def main() -> int:
     return 0
 
 
-def _best(contenders: dict[str, Callable[[], int]], reference: str, what: str) -> dict[str, float]:
-    """Rate of each contender in its best round; prints the table."""
-    rates = dict.fromkeys(contenders, 0.0)
+def _medians(contenders: dict[str, Callable[[], int]], reference: str, what: str) -> dict[str, float]:
+    """Median rate of each contender, taking turns; prints the table. A ratio is the median of those turn by turn."""
+    rates: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(ROUNDS):
         for name, run in contenders.items():
             started = time.process_time()
             count = run()
-            rates[name] = max(rates[name], count / (time.process_time() - started))
+            rates[name].append(count / (time.process_time() - started))
     print(f"\n{what:44} {'per CPU s':>12} {'ratio':>7}")
-    for name, rate in rates.items():
-        print(f"{name:44} {rate:12.0f} {rate / rates[reference]:7.2f}")
-    return rates
+    for name, found in rates.items():
+        ratio = median(one / other for one, other in zip(found, rates[reference], strict=True))
+        print(f"{name:44} {median(found):12.0f} {ratio:7.2f}")
+    return {name: median(found) for name, found in rates.items()}
 
 
 # --- writing --------------------------------------------------------------------------------------------------------
@@ -107,8 +109,7 @@ def _write(folder: Path, count: int) -> dict[str, float]:
     def ours(compression: str) -> int:
         with BagWriter(fresh(), WriterOptions(compression=compression)) as bag:
             numbers = topics(bag.add_topic)
-            for i in range(count):
-                bag.write(numbers[i % TOPICS], i * 200_000, MESSAGES[i % 1000], i * 200_000, i)
+            bag.write_all((numbers[i % TOPICS], i * 200_000, MESSAGES[i % 1000], i * 200_000, i) for i in range(count))
         return count
 
     def recorder_path() -> int:
@@ -155,7 +156,7 @@ def _write(folder: Path, count: int) -> dict[str, float]:
     for compression in ("none", "lz4", "zstd"):
         contenders[f"BagWriter, {compression}"] = lambda compression=compression: ours(compression)
     contenders["recorder: queue + thread + sync, zstd"] = recorder_path
-    return _best(contenders, reference, f"write {count} JointStates, {TOPICS} topics")
+    return _medians(contenders, reference, f"write {count} JointStates, {TOPICS} topics")
 
 
 def _mcap_package(path: Path, definition: str, count: int) -> int:
@@ -234,7 +235,7 @@ def _read(folder: Path, steps: int) -> dict[str, float]:
         return replay(path, folder / "again", Choice() if path == drive else choice)
 
     reference = "AnyReader with deserialisation"
-    return _best(
+    return _medians(
         {
             reference: lambda: bare(True),
             "AnyReader, raw": lambda: bare(False),

@@ -21,11 +21,8 @@ from typing import NamedTuple
 
 from iwm_power_manager.bags.limits import MESSAGE_OVERHEAD_BYTES
 from iwm_power_manager.bags.metadata import Topic
-from iwm_power_manager.bags.writer import BagWriter, MessageTooLarge, WriteFailed, WriterOptions
+from iwm_power_manager.bags.writer import BagWriter, MessageTooLarge, Sample, WriteFailed, WriterOptions
 from iwm_power_manager.errors import BagError
-
-#: One message: topic number, log time (ns), CDR bytes, publish time (ns), the publisher's counter.
-Sample = tuple[int, int, bytes, int, int]
 
 RECORDING, STOPPED, FAILED = "recording", "stopped", "failed"
 
@@ -274,11 +271,10 @@ class Recording:
             self._dropped_error += len(samples) if self._state == FAILED else 0
             return
         self._given += len(samples)
-        write, remaining = self._writer.write, iter(samples)
+        remaining = iter(samples)
         while True:
             try:
-                for number, log_ns, data, sent_ns, sequence in remaining:
-                    write(number, log_ns, data, sent_ns, sequence)
+                self._writer.write_all(remaining)
                 return
             except MessageTooLarge as error:
                 self._given -= 1
@@ -393,9 +389,9 @@ class Recording:
         path = _free_name(self.path, "snapshot_", self._snapshots)
         try:
             with self._new_bag(path) as bag:
-                for sample in self._memory:
-                    with suppress(MessageTooLarge):
-                        bag.write(*sample)
+                bag.write_all(
+                    sample for sample in self._memory if len(sample[2]) <= self.options.writer.max_message_bytes
+                )
         except WriteFailed as error:
             raise BagError(str(error)) from None  # the bag that is being recorded is another
         return path

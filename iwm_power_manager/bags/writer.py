@@ -29,6 +29,10 @@ from iwm_power_manager.bags.metadata import (
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.files import atomic_write, sync_folder
 
+#: One message: topic's number, log time (ns, when it was received and what readers sort by), CDR bytes with their
+#: four bytes of encapsulation, publish time (ns, when it was sent), the publisher's counter (0 if unknown).
+Sample = tuple[int, int, bytes, int, int]
+
 LIBRARY = f"iwm_power_manager {__version__}"
 
 
@@ -154,24 +158,21 @@ class BagWriter:
     def write(
         self, topic: int, log_time_ns: int, data: bytes, publish_time_ns: int | None = None, sequence: int = 0
     ) -> None:
-        """Write one message.
+        """Write one message; arguments as in `Sample`, `publish_time_ns` None for the log time."""
+        sent_ns = log_time_ns if publish_time_ns is None else publish_time_ns
+        self.write_all(iter([(topic, log_time_ns, data, sent_ns, sequence)]))
 
-        Parameters
-        ----------
-        topic : what `add_topic` returned
-        log_time_ns : when it was received, the time readers sort by
-        data : the message as CDR, with its four bytes of encapsulation
-        publish_time_ns : when it was sent; None for the log time
-        sequence : the publisher's counter, 0 if unknown
-        """
-        if self._splits or self._file_start_ns is None or len(data) > self._largest:
-            self._prepare(topic, log_time_ns, len(data))
-        if publish_time_ns is None:
-            publish_time_ns = log_time_ns
-        self._add(self._channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
-        if self._pieces:  # a chunk is full
-            with self._failing():
-                self._open.push()
+    def write_all(self, samples: Iterator[Sample]) -> None:
+        """Write messages. After `MessageTooLarge` the iterator stands behind the one that was refused."""
+        watched = self._splits or self._file_start_ns is None
+        for topic, log_time_ns, data, publish_time_ns, sequence in samples:
+            if watched or len(data) > self._largest:
+                self._prepare(topic, log_time_ns, len(data))
+                watched = self._splits
+            self._add(self._channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
+            if self._pieces:  # a chunk is full
+                with self._failing():
+                    self._open.push()
 
     def _prepare(self, topic: int, log_time_ns: int, size: int) -> None:
         """Refuse a message that is too large; begin the next file, if the present one is full or old enough."""

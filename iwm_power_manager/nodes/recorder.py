@@ -32,9 +32,9 @@ from std_srvs.srv import Trigger
 from iwm_power_manager import __version__
 from iwm_power_manager.bags.mcap_file import COMPRESSIONS
 from iwm_power_manager.bags.metadata import Topic
-from iwm_power_manager.bags.recording import FAILED, Recording, RecordingOptions, Sample
+from iwm_power_manager.bags.recording import FAILED, Recording, RecordingOptions
 from iwm_power_manager.bags.recover import recover
-from iwm_power_manager.bags.writer import WriterOptions
+from iwm_power_manager.bags.writer import Sample, WriterOptions
 from iwm_power_manager.errors import BagError, IwmError, one_line
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.ros import ending

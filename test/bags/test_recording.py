@@ -21,9 +21,9 @@ from iwm_power_manager.bags import recording as recording_module
 from iwm_power_manager.bags.limits import MESSAGE_OVERHEAD_BYTES as SAMPLE_OVERHEAD_BYTES
 from iwm_power_manager.bags.mcap_file import McapFile
 from iwm_power_manager.bags.reader import BagReader
-from iwm_power_manager.bags.recording import Recording, RecordingOptions, Sample
+from iwm_power_manager.bags.recording import Recording, RecordingOptions
 from iwm_power_manager.bags.recover import recover
-from iwm_power_manager.bags.writer import WriterOptions
+from iwm_power_manager.bags.writer import Sample, WriterOptions
 from iwm_power_manager.errors import BagError
 
 SAMPLE_BYTES = SAMPLE_OVERHEAD_BYTES + len(float64(0.0))
@@ -216,7 +216,7 @@ from bags_helpers import float64, topic
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.recording import Recording, RecordingOptions
 from iwm_power_manager.bags.recover import recover
-from iwm_power_manager.bags.writer import WriterOptions
+from iwm_power_manager.bags.writer import Sample, WriterOptions
 
 disk, elsewhere = Path(sys.argv[1]), Path(sys.argv[2])
 
@@ -359,7 +359,7 @@ def test_a_fault_inside_the_writing_thread_is_a_failed_recording_not_a_silent_on
     recording = Recording(tmp_path / "bag")
     recording.start()
     recording.add_topic(topic("/a"))
-    monkeypatch.setattr(recording_module.BagWriter, "write", broken)
+    monkeypatch.setattr(recording_module.BagWriter, "write_all", broken)
     recording.put(samples(0, 1))
     assert recording.failed.wait(30)
     assert "boom" in recording.status().error
