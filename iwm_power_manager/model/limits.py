@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.motor import electrical_power_w
-from iwm_power_manager.model.parameters import Battery, Motor, VehicleParams
+from iwm_power_manager.model.parameters import Battery, VehicleParams
 
 
 @kernel
@@ -35,52 +35,6 @@ def battery_limits_w(soc: float, temperature_degc: float, battery: Battery) -> t
 
 
 @kernel
-def car_power_w(
-    front_torque_nm: float, rear_torque_nm: float, front_speed_radps: float, rear_speed_radps: float, motor: Motor
-) -> float:
-    """Electrical power of the four motors, W (eq. 23), left and right alike."""
-    front = electrical_power_w(front_torque_nm, front_speed_radps, motor)
-    rear = electrical_power_w(rear_torque_nm, rear_speed_radps, motor)
-    return 2.0 * (front + rear)
-
-
-@kernel
-def battery_scale(
-    front_torque_nm: float,
-    rear_torque_nm: float,
-    front_speed_radps: float,
-    rear_speed_radps: float,
-    discharge_limit_w: float,
-    charge_limit_w: float,
-    motor: Motor,
-) -> float:
-    """Largest factor 0..1 on the motor torques that keeps the battery inside its limits (eq. 24, 43).
-
-    Where even standby or losses at zero torque are too much, the factor is 0: torque cannot help then. So it is where
-    both limits are 0: that switches the motors off.
-    """
-    power = car_power_w(front_torque_nm, rear_torque_nm, front_speed_radps, rear_speed_radps, motor)
-    if -charge_limit_w <= power <= discharge_limit_w:
-        return 1.0
-    charging = power < -charge_limit_w
-    low = 0.0
-    high = 1.0
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        power = car_power_w(
-            middle * front_torque_nm, middle * rear_torque_nm, front_speed_radps, rear_speed_radps, motor
-        )
-        # Only the side that was violated: the losses of a weak regeneration, which an empty battery cannot cover, must
-        # not hide the stronger one that covers them.
-        if (power >= -charge_limit_w) if charging else (power <= discharge_limit_w):
-            low = middle
-        else:
-            high = middle
-    power = car_power_w(low * front_torque_nm, low * rear_torque_nm, front_speed_radps, rear_speed_radps, motor)
-    return low if -charge_limit_w <= power <= discharge_limit_w else 0.0
-
-
-@kernel
 def wheels_power_w(
     torque_nm: tuple[float, float, float, float],
     speed_radps: tuple[float, float, float, float],
@@ -90,7 +44,7 @@ def wheels_power_w(
     """Electrical power of the four motors, W (eq. 23), with each torque times a factor."""
     front = vehicle.front.motor
     rear = vehicle.rear.motor
-    # Axle by axle: left and right alike give the bits of `car_power_w`.
+    # Axle by axle: left and right alike give the bits of twice an axle's.
     return (
         electrical_power_w(factor * torque_nm[0], speed_radps[0], front)
         + electrical_power_w(factor * torque_nm[1], speed_radps[1], front)
@@ -108,7 +62,11 @@ def wheels_scale(
     charge_limit_w: float,
     vehicle: VehicleParams,
 ) -> float:
-    """As `battery_scale`, for four wheels that may differ."""
+    """Largest factor 0..1 on the motor torques that keeps the battery inside its limits (eq. 24, 43).
+
+    Where even standby or losses at zero torque are too much, the factor is 0: torque cannot help then. So it is where
+    both limits are 0: that switches the motors off.
+    """
     power = wheels_power_w(torque_nm, speed_radps, 1.0, vehicle)
     if -charge_limit_w <= power <= discharge_limit_w:
         return 1.0
@@ -118,6 +76,8 @@ def wheels_scale(
     for _ in range(40):
         middle = 0.5 * (low + high)
         power = wheels_power_w(torque_nm, speed_radps, middle, vehicle)
+        # Only the side that was violated: the losses of a weak regeneration, which an empty battery cannot cover, must
+        # not hide the stronger one that covers them.
         if (power >= -charge_limit_w) if charging else (power <= discharge_limit_w):
             low = middle
         else:

@@ -33,7 +33,7 @@ from iwm_power_manager.control.supervision import (
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.thresholds import Thresholds, actuator_limits, input_limits
 from iwm_power_manager.control.types import GATE_BOTH, GATE_FRONT, GATE_REAR, initial_state
-from iwm_power_manager.model.limits import car_power_w
+from iwm_power_manager.model.limits import wheels_power_w
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
@@ -286,9 +286,8 @@ class TestBattery:
         drive = Drive()
         values = drive.run(60, demand=-4000.0, soc=1.0)
         assert values["charge_limit_w"] == 0.0
-        front, _, rear, _ = motor(values)
         # A little braking torque is left to the motors: what their own losses eat up.
-        assert car_power_w(front, rear, 10.0 / RADIUS, 10.0 / RADIUS, VEHICLE.front.motor) >= -1e-6
+        assert wheels_power_w(motor(values), (10.0 / RADIUS,) * 4, 1.0, VEHICLE) >= -1e-6
         assert (sum(friction(values)) + sum(motor(values))) * 10.0 / RADIUS == pytest.approx(-4000.0)
         assert sum(friction(values)) < 10.0 * sum(motor(values))
 

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Changes that mistake one side of the car for the other: front for rear, left for right.
+
+Cosmic Ray has no such change, and it is the likeliest mistake in a law that counts wheels. Swapped are, one at a time:
+
+- a name that is read, such as `front_slip`, `vehicle.front` or `fl`, where the other side's name exists in the module;
+- a constant index of a wheel or an axle (0 to 3), for the wheel beside it and for the one behind it;
+- two elements of a tuple, or two arguments of a call, that name the two sides of the same thing;
+- two of the four elements of a tuple in the order of the wheels: of one axle, or of one side.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+
+#: Part of a name -> the same of the other side.
+_ACROSS = {"left": "right", "right": "left", "fl": "fr", "fr": "fl", "rl": "rr", "rr": "rl"}
+_ALONG = {"front": "rear", "rear": "front", "fl": "rl", "rl": "fl", "fr": "rr", "rr": "fr"}
+_PART = re.compile(r"[A-Za-z]+|[^A-Za-z]+")
+_WHEELS = 4
+
+
+def _other_names(name: str) -> set[str]:
+    """The names of the other side."""
+    parts = _PART.findall(name)
+    swapped = {"".join(sides.get(part, part) for part in parts) for sides in (_ACROSS, _ALONG)}
+    return swapped - {name}
+
+
+class _Text:
+    """A source whose pieces are found by their place in its tree."""
+
+    def __init__(self, source: str) -> None:
+        self.data = source.encode()
+        self.tree = ast.parse(source)
+        self._starts = [0]
+        for line in self.data.splitlines(keepends=True):
+            self._starts.append(self._starts[-1] + len(line))
+
+    def span(self, node: ast.expr) -> tuple[int, int]:
+        assert node.end_lineno is not None
+        assert node.end_col_offset is not None
+        return (
+            self._starts[node.lineno - 1] + node.col_offset,
+            self._starts[node.end_lineno - 1] + node.end_col_offset,
+        )
+
+    def of(self, node: ast.expr) -> str:
+        start, end = self.span(node)
+        return self.data[start:end].decode()
+
+    def replaced(self, start: int, end: int, text: str) -> str:
+        return (self.data[:start] + text.encode() + self.data[end:]).decode()
+
+    def exchanged(self, one: ast.expr, other: ast.expr) -> str:
+        (a, b), (c, d) = self.span(one), self.span(other)
+        data = self.data
+        return (data[:a] + data[c:d] + data[b:c] + data[a:b] + data[d:]).decode()
+
+
+def _known_names(tree: ast.AST) -> set[str]:
+    known: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            known.add(node.id)
+        elif isinstance(node, ast.Attribute):
+            known.add(node.attr)
+        elif isinstance(node, ast.arg):
+            known.add(node.arg)
+    return known
+
+
+def _pairs(text: _Text, elements: list[ast.expr], wheels: bool) -> Iterator[tuple[ast.expr, ast.expr]]:
+    """Elements that stand for the two sides of something."""
+    for i, one in enumerate(elements):
+        for j, other in enumerate(elements[i + 1 :], i + 1):
+            beside = wheels and i ^ j in (1, 2)
+            if text.of(one) != text.of(other) and (beside or text.of(other) in _other_names(text.of(one))):
+                yield one, other
+
+
+def swaps_of(source: str) -> list[str]:
+    """The source with one swap each, in the order of their places."""
+    text = _Text(source)
+    known = _known_names(text.tree)
+    # What is only asked for membership has no order.
+    unordered = {
+        id(part)
+        for node in ast.walk(text.tree)
+        if isinstance(node, ast.Compare) and isinstance(node.ops[0], ast.In | ast.NotIn)
+        for part in ast.walk(node.comparators[0])
+    }
+    found: list[str] = []
+    for node in ast.walk(text.tree):
+        if id(node) in unordered:
+            continue
+        if isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Load):
+            name = node.id if isinstance(node, ast.Name) else node.attr
+            end = text.span(node)[1]
+            start = end - len(name.encode())
+            found += [text.replaced(start, end, other) for other in sorted(_other_names(name) & known)]
+        elif isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
+            index = node.slice.value
+            if type(index) is int and 0 <= index < _WHEELS:
+                found += [text.replaced(*text.span(node.slice), str(index ^ bit)) for bit in (1, 2)]
+        elif isinstance(node, ast.Tuple):
+            found += [text.exchanged(*pair) for pair in _pairs(text, node.elts, len(node.elts) == _WHEELS)]
+        elif isinstance(node, ast.Call):
+            found += [text.exchanged(*pair) for pair in _pairs(text, node.args, False)]
+    return found
