@@ -12,6 +12,7 @@ import importlib
 import os
 import signal
 import sys
+from functools import partial
 
 #: Ctrl-C is how a node is ended: `ros2 launch` reports every other code as a crash.
 NODE_ENDED = 0
@@ -55,41 +56,11 @@ def run(module: str, interrupted: int) -> int:
             signal.signal(number, signal.SIG_IGN)
 
 
-def import_cycle() -> int:
-    """Command `import_cycle`."""
-    return run("iwm_power_manager.tools.import_cycle", INTERRUPTED)
-
-
-def import_motor() -> int:
-    """Command `import_motor`."""
-    return run("iwm_power_manager.tools.import_motor", INTERRUPTED)
-
-
-def power_manager() -> int:
-    """Node `power_manager`."""
-    return run("iwm_power_manager.nodes.power_manager", NODE_ENDED)
-
-
-def recorder() -> int:
-    """Node `recorder`."""
-    return run("iwm_power_manager.nodes.recorder", NODE_ENDED)
-
-
-def replay() -> int:
-    """Command `replay`."""
-    return run("iwm_power_manager.tools.replay", INTERRUPTED)
-
-
-def set_parameter() -> int:
-    """Command `set_parameter`."""
-    return run("iwm_power_manager.tools.set_parameter", INTERRUPTED)
-
-
-def solve_policy() -> int:
-    """Command `solve_policy`."""
-    return run("iwm_power_manager.tools.solve_policy", INTERRUPTED)
-
-
-def watch_car() -> int:
-    """Command `watch_car`."""
-    return run("iwm_power_manager.tools.watch_car", INTERRUPTED)
+import_cycle = partial(run, "iwm_power_manager.tools.import_cycle", INTERRUPTED)
+import_motor = partial(run, "iwm_power_manager.tools.import_motor", INTERRUPTED)
+power_manager = partial(run, "iwm_power_manager.nodes.power_manager", NODE_ENDED)
+recorder = partial(run, "iwm_power_manager.nodes.recorder", NODE_ENDED)
+replay = partial(run, "iwm_power_manager.tools.replay", INTERRUPTED)
+set_parameter = partial(run, "iwm_power_manager.tools.set_parameter", INTERRUPTED)
+solve_policy = partial(run, "iwm_power_manager.tools.solve_policy", INTERRUPTED)
+watch_car = partial(run, "iwm_power_manager.tools.watch_car", INTERRUPTED)

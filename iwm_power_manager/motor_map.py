@@ -79,33 +79,14 @@ class LossFit(NamedTuple):
         return f"{a:.4g} + {b:.4g} w + {c:.4g} w^2 + {d:.4g} |T| + {e:.4g} T^2 W"
 
 
-def load_efficiency_map(path: Path | str, mirror: bool | None = None) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read a motor map and turn it into losses on a full grid.
+def read_map(path: Path | str) -> MotorMap:
+    """The points of a map's CSV on their grid; `ConfigError` names the line of a mistake.
 
     The CSV has the columns `speed_rad_s,torque_nm,efficiency`. Efficiency is mechanical over electrical power when
     driving and electrical over mechanical when regenerating (eq. 14, 15). At zero speed or zero torque it says nothing:
-    whatever stands there is ignored, and the loss continued from the neighbours on the grid. Points that are missing,
-    empty, NaN or 0 are taken to lie outside the motor's limits (`missing` checks that); their loss is extrapolated
-    along torque, so that cells across the limit have one.
-
-    Parameters
-    ----------
-    mirror : True gives a map of one sign the other one: regeneration loses what driving loses at the same torque.
-        None does so for a map of driving torques (vehicle files of format 1); one of braking torques is refused.
-
-    Returns
-    -------
-    speed_radps : (n,), torque_nm : (m,), loss_w : (n, m)
-
-    Raises
-    ------
-    ConfigError
+    whatever stands there is ignored. Points that are missing, empty, NaN or 0 are taken to lie outside the motor's
+    limits (`missing` checks that).
     """
-    return filled(mirrored(path, read_map(path), mirror))
-
-
-def read_map(path: Path | str) -> MotorMap:
-    """The points of a map's CSV on their grid; `ConfigError` names the line of a mistake."""
     points: dict[tuple[float, float], float] = {}
     reader = csv.reader(files.read_text(path).splitlines())
     line = 1
@@ -179,7 +160,13 @@ def _brakes_harder(efficiency: dict[tuple[float, float], float], s: float, t: fl
 
 
 def mirrored(path: Path | str, given: MotorMap, mirror: bool | None) -> MotorMap:
-    """The map with both signs of torque; see `load_efficiency_map`."""
+    """The map with both signs of torque.
+
+    Parameters
+    ----------
+    mirror : True gives a map of one sign the other one: regeneration loses what driving loses at the same torque.
+        None does so for a map of driving torques (vehicle files of format 1); one of braking torques is refused.
+    """
     known = given.torque_nm[~np.all(np.isnan(given.loss_w), axis=0)]
     driving, braking = bool(np.any(known > 0.0)), bool(np.any(known < 0.0))
     if driving and braking:

@@ -127,17 +127,6 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
     return Vehicle(content["name"].strip(), path, drive, params, _hash(params), notes)
 
 
-def with_idle_drive(vehicle: Vehicle, idle_drive: str) -> Vehicle:
-    """The same car with another `idle_drive`."""
-    code = IDLE_DRIVES[files.check_choice("idle_drive", "idle_drive", idle_drive, IDLE_DRIVES)]
-    params = vehicle.params
-    params = params._replace(
-        front=params.front._replace(motor=params.front.motor._replace(idle_drive=code)),
-        rear=params.rear._replace(motor=params.rear.motor._replace(idle_drive=code)),
-    )
-    return dataclasses.replace(vehicle, idle_drive=idle_drive, params=params, hash=_hash(params))
-
-
 def with_params(vehicle: Vehicle, name: str, params: VehicleParams) -> Vehicle:
     """A car with other numbers, for sensitivity studies; it gets its own hash."""
     return dataclasses.replace(vehicle, name=name, params=params, hash=_hash(params))

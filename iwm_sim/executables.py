@@ -3,29 +3,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 from iwm_power_manager.executables import INTERRUPTED, NODE_ENDED, run
 
-
-def demo() -> int:
-    """Command `demo`."""
-    return run("iwm_sim.tools.demo", INTERRUPTED)
-
-
-def evaluate() -> int:
-    """Command `evaluate`."""
-    return run("iwm_sim.tools.evaluate", INTERRUPTED)
-
-
-def learn_policy() -> int:
-    """Command `learn_policy`."""
-    return run("iwm_sim.tools.learn", INTERRUPTED)
-
-
-def precompile() -> int:
-    """Command `precompile`."""
-    return run("iwm_sim.tools.precompile", INTERRUPTED)
-
-
-def simulator() -> int:
-    """Node `simulator`."""
-    return run("iwm_sim.simulator", NODE_ENDED)
+demo = partial(run, "iwm_sim.tools.demo", INTERRUPTED)
+evaluate = partial(run, "iwm_sim.tools.evaluate", INTERRUPTED)
+learn_policy = partial(run, "iwm_sim.tools.learn", INTERRUPTED)
+precompile = partial(run, "iwm_sim.tools.precompile", INTERRUPTED)
+simulator = partial(run, "iwm_sim.simulator", NODE_ENDED)

@@ -20,7 +20,7 @@ from iwm_power_manager.motor_map import (
     extended,
     filled,
     fit_loss,
-    load_efficiency_map,
+    mirrored,
     missing,
     read_map,
 )
@@ -30,6 +30,11 @@ from iwm_power_manager.vehicle import load_vehicle
 CAR = share_path("config/vehicles/jalalmaab_2015_map.yaml")
 MAP = share_path("config/motors/siemens_pm_7500w.csv")
 COEFFICIENTS = (46.0, 0.69, 0.0151, 2.03, 0.0685)
+
+
+def load_efficiency_map(path, mirror=None):
+    """Losses on a full grid, as a vehicle file asks for them."""
+    return filled(mirrored(path, read_map(path), mirror))
 
 
 def write(folder: Path, *rows: str, header: str = "speed_rad_s,torque_nm,efficiency") -> Path:

@@ -32,7 +32,7 @@ from iwm_power_manager.policy import (
     save_policy,
 )
 from iwm_power_manager.share import share_path
-from iwm_power_manager.vehicle import load_vehicle, with_idle_drive
+from iwm_power_manager.vehicle import load_vehicle
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"))
 AXES = {
@@ -147,7 +147,7 @@ def test_the_stored_cost_is_rounded_within_the_stated_bound(solved):
 
 def test_a_policy_belongs_to_one_car(policy):
     policy.check_vehicle(CAR)
-    other = with_idle_drive(CAR, "enabled")
+    other = load_vehicle(CAR.path, "enabled")
     with pytest.raises(PolicyError, match=r"p\.npz: was solved for '.*idle_drive enabled\); solve one"):
         policy.check_vehicle(other, "p.npz")
 

@@ -17,7 +17,7 @@ from iwm_power_manager.files import read_yaml
 from iwm_power_manager.mdp.demand_counts import load_transitions
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.motor_import import read_points
-from iwm_power_manager.motor_map import load_efficiency_map, map_of
+from iwm_power_manager.motor_map import map_of, read_map
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.mapping import load_mapping
@@ -41,7 +41,7 @@ def _motor(path):
 
 
 YAML_LOADERS = [(load_vehicle, CAR), (load_vehicle, TWO), (load_problem, GRID), (load_mapping, MAPPING)]
-TABLE_LOADERS = [(load_cycle, CYCLE), (load_efficiency_map, MAP), (_log, CYCLE), (_motor, MAP)]
+TABLE_LOADERS = [(load_cycle, CYCLE), (read_map, MAP), (_log, CYCLE), (_motor, MAP)]
 
 #: Values that have broken a loader somewhere.
 # fmt: off

@@ -13,8 +13,9 @@ import pytest
 from iwm_power_manager import files, vehicle, vehicle_table
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.motor import electrical_power_w, enabled_loss_w, idle_drag_nm
+from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.share import share_path
-from iwm_power_manager.vehicle import load_vehicle, with_idle_drive, with_params
+from iwm_power_manager.vehicle import load_vehicle, with_params
 from oracles.step import loss_w
 
 FOLDER = share_path("config/vehicles")
@@ -354,22 +355,14 @@ def test_every_number_of_the_file_arrives_in_the_parameters(path, monkeypatch):
 
 
 def test_idle_drive_can_be_replaced():
-    car = load_vehicle(PAPER)
-    assert car.idle_drive == "drag"
+    assert load_vehicle(PAPER).idle_drive == "drag"
     for name in ("none", "drag", "enabled"):
         other = load_vehicle(PAPER, name)
         assert other.idle_drive == name
-        again = with_idle_drive(car, name)
-        assert (again.hash, again.idle_drive, again.params.front.motor.idle_drive) == (
-            other.hash,
-            name,
-            other.params.front.motor.idle_drive,
-        )
+        assert other.params.front.motor.idle_drive == other.params.rear.motor.idle_drive == IDLE_DRIVES[name]
     assert len({load_vehicle(PAPER, name).hash for name in ("none", "drag", "enabled")}) == 3
     with pytest.raises(ConfigError, match=r"idle_drive: 'off' is unknown; allowed: none \| drag \| enabled"):
         load_vehicle(PAPER, "off")
-    with pytest.raises(ConfigError, match="idle_drive"):
-        with_idle_drive(car, "off")
 
 
 def test_a_car_with_other_numbers_is_another_car():

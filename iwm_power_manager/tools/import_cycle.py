@@ -7,8 +7,6 @@ Exit codes: 0 written; 2 bad arguments or files; 130 interrupted.
 from __future__ import annotations
 
 import argparse
-import io
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -16,17 +14,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iwm_power_manager import __version__
-from iwm_power_manager.errors import IwmError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.tables import SEPARATORS
+from iwm_power_manager.tools import command
 from iwm_power_manager.tools import options as given
 from iwm_power_manager.trace_units import SPEED_UNITS, TIME_UNITS
 
 if TYPE_CHECKING:
     from iwm_power_manager.cycle import Cycle
     from iwm_power_manager.cycle_import import Log
-
-WRITTEN, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
 _DESCRIPTION = """\
 Make a drive cycle (CSV of time_s, speed_mps[, grade]) of a drive that something else has logged.
@@ -53,9 +49,7 @@ exit codes: 0 written, 2 bad arguments or files, 130 interrupted
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
-    result = argparse.ArgumentParser(
-        "import_cycle", description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    result = command.described("import_cycle", _DESCRIPTION, _EXAMPLES)
     result.add_argument("log", metavar="LOG", help="table with a header line; lines that start with # are skipped")
     table = result.add_argument_group("the table")
     table.add_argument("--separator", choices=("auto", *SEPARATORS), default="auto", help="default: %(default)s")
@@ -106,24 +100,16 @@ def parser() -> argparse.ArgumentParser:
     output.add_argument("--plot", metavar="PNG", help="picture of the log and the cycle made of it")
     output.add_argument("--json", metavar="FILE", help="what was understood, with the numbers")
     output.add_argument("--quiet", action="store_true", help="print errors and warnings only")
-    output.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
-    try:
-        return _import(options)
-    except IwmError as error:
-        print(f"import_cycle: error: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("import_cycle: interrupted; nothing half-written is left", file=sys.stderr)
-        return INTERRUPTED
+    return command.ended("import_cycle", lambda: _import(options))
 
 
-def _import(options: argparse.Namespace) -> int:
+def _import(options: argparse.Namespace) -> None:
     from iwm_power_manager.cycle_import import cycle_text, read_log, to_cycle
     from iwm_power_manager.model.feasible import trace_warnings
     from iwm_power_manager.share import resolve
@@ -151,8 +137,7 @@ def _import(options: argparse.Namespace) -> int:
     if options.plot:
         _draw(Path(options.plot), log, raw, cycle, options.max_gap)
     if options.json:
-        atomic_write(options.json, (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode())
-    return WRITTEN
+        command.write_json(options.json, numbers)
 
 
 def _numbers(options: argparse.Namespace, log: Log, cycle: Cycle, raw: Cycle, vehicle: Any) -> dict[str, Any]:
@@ -208,11 +193,9 @@ def _text(options: argparse.Namespace, log: Log, numbers: dict[str, Any]) -> str
 
 
 def _draw(path: Path, log: Log, raw: Cycle, cycle: Cycle, max_gap_s: float) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 6.0), layout="constrained")
-    FigureCanvasAgg(figure)
     whole, part = figure.subplots(2, 1)
     # The hardest minute is where a wrong unit or too much smoothing shows.
     steepest = int(abs(cycle.speed_mps[1:] - cycle.speed_mps[:-1]).argmax())
@@ -229,9 +212,7 @@ def _draw(path: Path, log: Log, raw: Cycle, cycle: Cycle, max_gap_s: float) -> N
             whole.axvspan(start, start + length, color="C3", alpha=0.2)
     whole.legend(loc="upper right")
     whole.set_title(f"{cycle.name}: {cycle.duration_s:.0f} s, {cycle.distance_m / 1000.0:.2f} km")
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
-    atomic_write(path, stream.getvalue())
+    command.write_picture(path, figure)
 
 
 if __name__ == "__main__":

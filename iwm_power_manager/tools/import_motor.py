@@ -7,23 +7,19 @@ Exit codes: 0 written; 2 bad arguments or files; 130 interrupted.
 from __future__ import annotations
 
 import argparse
-import io
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iwm_power_manager import __version__
-from iwm_power_manager.errors import IwmError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.tables import SEPARATORS
+from iwm_power_manager.tools import command
 from iwm_power_manager.tools import options as given
 
 if TYPE_CHECKING:
     from iwm_power_manager.motor_map import LossFit, MotorMap, Reach
-
-WRITTEN, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
 _DESCRIPTION = """\
 Make a motor map (CSV of speed_rad_s, torque_nm, efficiency) of a table of efficiencies or losses, and show what was
@@ -49,9 +45,7 @@ exit codes: 0 written, 2 bad arguments or files, 130 interrupted
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
-    result = argparse.ArgumentParser(
-        "import_motor", description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    result = command.described("import_motor", _DESCRIPTION, _EXAMPLES)
     result.add_argument("table", metavar="TABLE", help="lines that start with # are skipped")
     table = result.add_argument_group("the table")
     table.add_argument("--separator", choices=("auto", *SEPARATORS), default="auto", help="default: %(default)s")
@@ -94,24 +88,16 @@ def parser() -> argparse.ArgumentParser:
     output.add_argument("--plot", metavar="PNG", help="picture of the map, points and gaps included")
     output.add_argument("--json", metavar="FILE", help="what was understood, with the numbers")
     output.add_argument("--quiet", action="store_true", help="print errors and warnings only")
-    output.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
-    try:
-        return _import(options)
-    except IwmError as error:
-        print(f"import_motor: error: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("import_motor: interrupted; nothing half-written is left", file=sys.stderr)
-        return INTERRUPTED
+    return command.ended("import_motor", lambda: _import(options))
 
 
-def _import(options: argparse.Namespace) -> int:
+def _import(options: argparse.Namespace) -> None:
     import numpy as np
 
     from iwm_power_manager.motor_import import map_text, read_points
@@ -157,8 +143,7 @@ def _import(options: argparse.Namespace) -> int:
     if options.plot:
         _draw(Path(options.plot), found, reach)
     if options.json:
-        atomic_write(options.json, (json.dumps(numbers, indent=1, allow_nan=False) + "\n").encode())
-    return WRITTEN
+        command.write_json(options.json, numbers)
 
 
 def _best(efficiency: dict[tuple[float, float], float]) -> dict[str, float]:
@@ -207,11 +192,9 @@ def _text(options: argparse.Namespace, found: MotorMap, fit: LossFit, numbers: d
 
 def _draw(path: Path, found: MotorMap, reach: Reach) -> None:
     import numpy as np
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 6.0), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots()
     speed, torque = np.meshgrid(found.speed_radps, found.torque_nm, indexing="ij")
     power = speed * torque
@@ -231,9 +214,7 @@ def _draw(path: Path, found: MotorMap, reach: Reach) -> None:
     axes.set_xlabel("speed, rad/s")
     axes.set_ylabel("torque, N m (driving positive)")
     axes.legend(loc="upper right")
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
-    atomic_write(path, stream.getvalue())
+    command.write_picture(path, figure)
 
 
 if __name__ == "__main__":

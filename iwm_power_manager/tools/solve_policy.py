@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from iwm_power_manager import __version__
 from iwm_power_manager.cycle import Cycle, load_cycle
-from iwm_power_manager.errors import ConfigError, IwmError
+from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write, check_number
 from iwm_power_manager.mdp.certify import bellman_bound
 from iwm_power_manager.mdp.demand import (
@@ -41,10 +41,11 @@ from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.demand import drive_source, read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
+from iwm_power_manager.tools.command import described, ended
 from iwm_power_manager.tools.options import several
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
-SOLVED, UNSOLVED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+SOLVED, UNSOLVED = 0, 1
 
 _DESCRIPTION = """\
 Solve the stochastic power split of a car and write it as policy files.
@@ -80,12 +81,7 @@ exit codes: 0 solved or checked, 1 a policy missed its bound, 2 bad arguments or
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
-    result = argparse.ArgumentParser(
-        prog="solve_policy",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    result = described("solve_policy", _DESCRIPTION, _EXAMPLES)
     problem = result.add_argument_group("problem")
     problem.add_argument("--vehicle", required=True, metavar="FILE", help="car, YAML (config/vehicles/)")
     problem.add_argument(
@@ -132,21 +128,13 @@ def parser() -> argparse.ArgumentParser:
     )
     output.add_argument("--quiet", action="store_true", help="print errors only")
     output.add_argument("--check", nargs="+", metavar="POLICY", help="verify policy files instead of solving")
-    output.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
-    try:
-        return _check(options) if options.check else _solve(options)
-    except IwmError as error:
-        print(f"solve_policy: error: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("solve_policy: interrupted; nothing half-written is left", file=sys.stderr)
-        return INTERRUPTED
+    return ended("solve_policy", lambda: _check(options) if options.check else _solve(options))
 
 
 def _solve(options: argparse.Namespace) -> int:

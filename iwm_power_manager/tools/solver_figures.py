@@ -3,21 +3,19 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.demand import THIN_ROW_STEPS, DemandChain
 from iwm_power_manager.policy import Policy
+from iwm_power_manager.tools.command import write_picture
 
 
 def draw_solution(policies: Sequence[Policy], path: Path | str) -> None:
@@ -29,11 +27,7 @@ def draw_solution(policies: Sequence[Policy], path: Path | str) -> None:
     draw_convergence(figure.add_subplot(grid[0, columns // 2 :]), policies)
     for column, policy in enumerate(policies):
         draw_policy(figure.add_subplot(grid[1, column]), policy)
-    output = io.BytesIO()
-    FigureCanvasAgg(figure)
-    # No date, no library version: the same policies give the same bytes.
-    figure.savefig(output, format="png", dpi=110, metadata={"Software": None})
-    atomic_write(path, output.getvalue())
+    write_picture(path, figure)
 
 
 def draw_demand(axes: Axes, chain: DemandChain) -> None:

@@ -8,6 +8,7 @@ manager makes of it. It polls, so that one process can relay four topics at 100 
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 import random
 import time
@@ -44,128 +45,100 @@ def stop(_message: Any, _now_s: float) -> Iterable[Any]:
     return ()
 
 
-class Delay:
+def delay(delay_s: float) -> Transform:
     """Every message some time later."""
+    waiting: deque[tuple[float, Any]] = deque()
 
-    def __init__(self, delay_s: float) -> None:
-        self._delay_s = delay_s
-        self._waiting: deque[tuple[float, Any]] = deque()
+    def delayed(message: Any, now_s: float) -> Iterable[Any]:
+        waiting.append((now_s + delay_s, message))
+        while waiting and waiting[0][0] <= now_s:
+            yield waiting.popleft()[1]
 
-    def __call__(self, message: Any, now_s: float) -> Iterable[Any]:
-        """Messages to send instead."""
-        self._waiting.append((now_s + self._delay_s, message))
-        while self._waiting and self._waiting[0][0] <= now_s:
-            yield self._waiting.popleft()[1]
+    return delayed
 
 
-class Freeze:
+def freeze(*, restamp: bool) -> Transform:
     """The first message again and again; with `restamp`, only its value."""
+    first: list[Any] = []
 
-    def __init__(self, *, restamp: bool) -> None:
-        self._restamp = restamp
-        self._first: Any = None
+    def frozen(message: Any, _now_s: float) -> Iterable[Any]:
+        first.append(message)
+        again = copy.deepcopy(first[0])
+        del first[1:]
+        if restamp:
+            again.header.stamp = message.header.stamp
+        return (again,)
 
-    def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
-        """Messages to send instead."""
-        if self._first is None:
-            self._first = message
-        frozen = copy.deepcopy(self._first)
-        if self._restamp:
-            frozen.header.stamp = message.header.stamp
-        return (frozen,)
+    return frozen
 
 
-class Repeat:
+def repeat(times: int) -> Transform:
     """Every message several times, with stamps a little apart."""
 
-    def __init__(self, times: int) -> None:
-        self._times = times
-
-    def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
-        """Messages to send instead."""
-        for i in range(self._times):
+    def repeated(message: Any, _now_s: float) -> Iterable[Any]:
+        for i in range(times):
             again = copy.deepcopy(message)
             if hasattr(again, "header"):
                 again.header.stamp = m.ns_to_stamp(m.stamp_to_ns(message.header.stamp) + i * 1000)
             yield again
 
+    return repeated
 
-class Thin:
+
+def thin(every: int) -> Transform:
     """Only every n-th message."""
-
-    def __init__(self, every: int) -> None:
-        self._every = every
-        self._count = 0
-
-    def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
-        """Messages to send instead."""
-        self._count += 1
-        return (message,) if self._count % self._every == 0 else ()
+    numbers = itertools.count(1)
+    return lambda message, _now_s: (message,) if next(numbers) % every == 0 else ()
 
 
-class Lose:
+def lose(probability: float, seed: int) -> Transform:
     """Each message with a probability."""
-
-    def __init__(self, probability: float, seed: int) -> None:
-        self._probability = probability
-        self._random = random.Random(seed)
-
-    def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
-        """Messages to send instead."""
-        return () if self._random.random() < self._probability else (message,)
+    dice = random.Random(seed)
+    return lambda message, _now_s: () if dice.random() < probability else (message,)
 
 
-class Restamp:
+def restamp(shift_s: float) -> Transform:
     """Stamps shifted by a time."""
+    shift_ns = round(shift_s * _NS_PER_S)
 
-    def __init__(self, shift_s: float) -> None:
-        self._shift_ns = round(shift_s * _NS_PER_S)
-
-    def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
-        """Messages to send instead."""
-        field = "clock" if hasattr(message, "clock") else "header"
-        if field == "clock":
-            message.clock = m.ns_to_stamp(m.stamp_to_ns(message.clock) + self._shift_ns)
+    def restamped(message: Any, _now_s: float) -> Iterable[Any]:
+        if hasattr(message, "clock"):
+            message.clock = m.ns_to_stamp(m.stamp_to_ns(message.clock) + shift_ns)
         else:
-            message.header.stamp = m.ns_to_stamp(m.stamp_to_ns(message.header.stamp) + self._shift_ns)
+            message.header.stamp = m.ns_to_stamp(m.stamp_to_ns(message.header.stamp) + shift_ns)
         return (message,)
 
+    return restamped
 
-class Replace:
+
+def replace(value: float) -> Transform:
     """Every value of the message by one number."""
 
-    def __init__(self, value: float) -> None:
-        self._value = value
-
-    def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
-        """Messages to send instead."""
+    def replaced(message: Any, _now_s: float) -> Iterable[Any]:
         if hasattr(message, "twist"):
-            message.twist.linear.x = self._value
+            message.twist.linear.x = value
         elif hasattr(message, "velocity"):
-            message.velocity = [self._value] * len(message.velocity)
+            message.velocity = [value] * len(message.velocity)
         elif hasattr(message, "percentage"):
-            message.percentage = self._value
+            message.percentage = value
         else:
-            message.data = self._value
+            message.data = value
         return (message,)
 
+    return replaced
 
-class Wheels:
+
+def wheels(order: tuple[int, ...]) -> Transform:
     """The wheels of the message in another order, or not all of them, each with its own value."""
 
-    def __init__(self, order: tuple[int, ...]) -> None:
-        self._order = order
-
-    def __call__(self, message: Any, _now_s: float) -> Iterable[Any]:
-        """Messages to send instead."""
-        return (
-            m.joint_message(
-                m.stamp_to_ns(message.header.stamp),
-                [message.name[i] for i in self._order],
-                velocity=[message.velocity[i] for i in self._order],
-                effort=[message.effort[i] for i in self._order],
-            ),
+    def chosen(message: Any, _now_s: float) -> Iterable[Any]:
+        name, velocity, effort = (
+            [values[i] for i in order] for values in (message.name, message.velocity, message.effort)
         )
+        stamp_ns = m.stamp_to_ns(message.header.stamp)
+        return (m.joint_message(stamp_ns, name, velocity=velocity, effort=effort),)
+
+    return chosen
 
 
 class Observation(NamedTuple):

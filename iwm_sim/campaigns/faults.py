@@ -226,32 +226,32 @@ def input_cases() -> Iterator[Case]:
         slow = topic == m.BATTERY_STATE
         yield Case(f"{topic} stopped", ZERO, on(topic, lambda: relay.stop))
         if stamped:
-            yield Case(f"{topic} delayed 1 s", ZERO, on(topic, lambda: relay.Delay(1.0)))
-            yield Case(f"{topic} frozen, stamp and all", ZERO, on(topic, lambda: relay.Freeze(restamp=False)))
+            yield Case(f"{topic} delayed 1 s", ZERO, on(topic, lambda: relay.delay(1.0)))
+            yield Case(f"{topic} frozen, stamp and all", ZERO, on(topic, lambda: relay.freeze(restamp=False)))
             if not slow:
                 remark = "with fresh stamps only a change of the others tells"
                 yield Case(
                     f"{topic} frozen, stamp runs on",
                     LIMITS,
-                    on(topic, lambda: relay.Freeze(restamp=True)),
+                    on(topic, lambda: relay.freeze(restamp=True)),
                     remark=remark,
                 )
         else:
             remark = "Float64 has no stamp: not to be told from the driver"
-            yield Case(f"{topic} delayed 1 s", LIMITS, on(topic, lambda: relay.Delay(1.0)), remark=remark)
-            yield Case(f"{topic} frozen", LIMITS, on(topic, lambda: relay.Freeze(restamp=False)), remark=remark)
-        yield Case(f"{topic} NaN", ZERO, on(topic, lambda: relay.Replace(math.nan)))
-        yield Case(f"{topic} out of range", ZERO, on(topic, lambda: relay.Replace(1e7)))
-        yield Case(f"{topic} at 10x rate", RIDE, on(topic, lambda: relay.Repeat(10)))
+            yield Case(f"{topic} delayed 1 s", LIMITS, on(topic, lambda: relay.delay(1.0)), remark=remark)
+            yield Case(f"{topic} frozen", LIMITS, on(topic, lambda: relay.freeze(restamp=False)), remark=remark)
+        yield Case(f"{topic} NaN", ZERO, on(topic, lambda: relay.replace(math.nan)))
+        yield Case(f"{topic} out of range", ZERO, on(topic, lambda: relay.replace(1e7)))
+        yield Case(f"{topic} at 10x rate", RIDE, on(topic, lambda: relay.repeat(10)))
         expect = RIDE if slow else LIMITS
         remark = "" if slow else "one message in 0.1 s: in and out of degraded"
-        yield Case(f"{topic} at 0.1x rate", expect, on(topic, lambda: relay.Thin(10)), remark=remark)
+        yield Case(f"{topic} at 0.1x rate", expect, on(topic, lambda: relay.thin(10)), remark=remark)
         if stamped:
-            yield Case(f"{topic} stamps jump 1 s back", ZERO, on(topic, lambda: relay.Restamp(-1.0)))
-            yield Case(f"{topic} stamps jump 1 s ahead", ZERO, on(topic, lambda: relay.Restamp(1.0)))
-    yield Case("wheel order shuffled", RIDE, on(m.WHEEL_STATES, lambda: relay.Wheels((2, 0, 3, 1))))
-    yield Case("one wheel missing", RIDE, on(m.WHEEL_STATES, lambda: relay.Wheels((0, 1, 2))))
-    yield Case("an axle's wheels missing", ZERO, on(m.WHEEL_STATES, lambda: relay.Wheels((0, 1))))
+            yield Case(f"{topic} stamps jump 1 s back", ZERO, on(topic, lambda: relay.restamp(-1.0)))
+            yield Case(f"{topic} stamps jump 1 s ahead", ZERO, on(topic, lambda: relay.restamp(1.0)))
+    yield Case("wheel order shuffled", RIDE, on(m.WHEEL_STATES, lambda: relay.wheels((2, 0, 3, 1))))
+    yield Case("one wheel missing", RIDE, on(m.WHEEL_STATES, lambda: relay.wheels((0, 1, 2))))
+    yield Case("an axle's wheels missing", ZERO, on(m.WHEEL_STATES, lambda: relay.wheels((0, 1))))
 
 
 def system_cases() -> Iterator[Case]:
@@ -266,7 +266,7 @@ def system_cases() -> Iterator[Case]:
 
     def braking_then(transform: relay.Transform) -> Callable[[Session], None]:
         def begin(session: Session) -> None:
-            session.spoil(m.POWER_DEMAND, relay.Replace(-8000.0))
+            session.spoil(m.POWER_DEMAND, relay.replace(-8000.0))
             session.relay.run(1.0)
             session.relay.forget()
             session.spoil(m.POWER_DEMAND, transform)
@@ -275,7 +275,7 @@ def system_cases() -> Iterator[Case]:
 
     brake_s = config.DEFAULTS["brake_release_s"]
     yield Case("all inputs stopped", ZERO, every(lambda _: relay.stop))
-    yield Case("30 % message loss", LIMITS, every(lambda seed: relay.Lose(0.3, seed)),
+    yield Case("30 % message loss", LIMITS, every(lambda seed: relay.lose(0.3, seed)),
                remark="three in a row are lost some three times a second: in and out of degraded")  # fmt: skip
     yield Case("brake demand stopped", ZERO, braking_then(relay.stop), allowed_s=float(brake_s),
                remark="friction brakes let go as slowly as docs/safety.md says")  # fmt: skip
@@ -293,7 +293,7 @@ def system_cases() -> Iterator[Case]:
 def clock_cases() -> Iterator[Case]:
     """What simulated time can do."""
     for shift_s, text in ((5.0, "5 s ahead"), (-5.0, "5 s back")):
-        yield Case(f"clock jumps {text}", ZERO, on("clock", partial(relay.Restamp, shift_s)))
+        yield Case(f"clock jumps {text}", ZERO, on("clock", partial(relay.restamp, shift_s)))
     yield Case("clock stops", ZERO, on("clock", lambda: relay.stop),
                allowed_s=float(config.DEFAULTS["clock_stopped_s"]) + 0.1)  # fmt: skip
 

@@ -10,16 +10,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from iwm_power_manager import __version__
 from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES
-from iwm_power_manager.errors import ConfigError, IwmError
+from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
+from iwm_power_manager.tools.command import described, ended
 from iwm_power_manager.tools.options import add_setting, number, several, whole
 from iwm_sim.study.names import DEFAULT_GRID, FIGURES, MAX_DT_S, REFERENCE, TABLES, cores
 from iwm_sim.study.variants import VARIANTS
-
-DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
 DEFAULT_VEHICLE = "config/vehicles/jalalmaab_2015.yaml"
 
@@ -83,13 +81,7 @@ MODES = {
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
-    result = argparse.ArgumentParser(
-        prog="evaluate",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    result = described("evaluate", _DESCRIPTION, _EXAMPLES, abbreviated=False)
     _add_cases(result.add_argument_group("cases (all combinations are driven)"))
     _add_policies(result.add_argument_group("policies (sdp, sdp_lookahead; preview takes its price from them)"))
     _add_law(result.add_argument_group("control law"))
@@ -198,7 +190,6 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--json", metavar="FILE", help="a row for each case, with its settings and hashes")
     group.add_argument("--save-series", metavar="DIR", help="a .npz for each case, with an array for each signal")
     group.add_argument("--quiet", action="store_true", help="no progress, no table")
-    group.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
 
 
 def _add_modes(parent: argparse._ArgumentGroup) -> None:
@@ -236,19 +227,16 @@ def _add_modes(parent: argparse._ArgumentGroup) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
-    try:
-        mode = next((name for name in MODES if getattr(options, name)), "")
-        refuse_useless(options, given_options(sys.argv[1:] if arguments is None else arguments), mode)
-        from iwm_sim.tools.evaluate_run import run
+    given = given_options(sys.argv[1:] if arguments is None else arguments)
+    return ended("evaluate", lambda: _evaluate(options, given))
 
-        run(mode, options)
-    except IwmError as error:
-        print(f"evaluate: error: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("evaluate: interrupted; nothing half-written is left", file=sys.stderr)
-        return INTERRUPTED
-    return DONE
+
+def _evaluate(options: argparse.Namespace, given: set[str]) -> None:
+    mode = next((name for name in MODES if getattr(options, name)), "")
+    refuse_useless(options, given, mode)
+    from iwm_sim.tools.evaluate_run import run
+
+    run(mode, options)
 
 
 # --- options that would have no effect ------------------------------------------------------------------------------

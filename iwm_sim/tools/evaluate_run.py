@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import json
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -18,6 +17,7 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.feasible import trace_warnings
+from iwm_power_manager.tools.command import write_json
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.road_report import text as road_text
 from iwm_sim.road_run import check_scenario
@@ -73,7 +73,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         say(f"{len(rows)} cases in {time.perf_counter() - started:.1f} s")
     if options.json:
         content = {"package_version": __version__, "rows": [row.to_json() for row in rows]}
-        atomic_write(options.json, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+        write_json(options.json, content)
         say(f"rows: {options.json}")
 
 
@@ -257,7 +257,7 @@ def _ablation(options: argparse.Namespace) -> None:
         print(plain_table(rows, ablation.columns(rows)))
     if options.json:
         content = {"package_version": __version__, "rows": [dataclasses.asdict(row) for row in rows]}
-        atomic_write(options.json, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+        write_json(options.json, content)
 
 
 def _fit_battery(options: argparse.Namespace) -> None:
@@ -276,7 +276,7 @@ def _fit_battery(options: argparse.Namespace) -> None:
         battery_fit.save_picture(figures.model_comparison(*fit.comparison), options.plot)
         tell(f"picture: {options.plot}")
     if options.json:
-        atomic_write(options.json, (json.dumps(fit.to_json(), indent=1, allow_nan=False) + "\n").encode())
+        write_json(options.json, fit.to_json())
 
 
 def _scenario(options: argparse.Namespace) -> None:
@@ -296,7 +296,7 @@ def _scenario(options: argparse.Namespace) -> None:
             made = {"scenario": scenario.name, "strategy": strategy, "passed": result.passed}
             rows.append(made | {"values": result.values})
     if options.json:
-        atomic_write(options.json, (json.dumps(rows, indent=1, allow_nan=False) + "\n").encode())
+        write_json(options.json, rows)
 
 
 def _frontier(options: argparse.Namespace) -> None:

@@ -7,7 +7,6 @@ Exit codes: 0 done; 2 bad arguments or files; 130 interrupted.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import tempfile
@@ -20,14 +19,15 @@ from tqdm import tqdm
 
 from iwm_power_manager import __version__
 from iwm_power_manager.cycle import load_cycle
-from iwm_power_manager.errors import ConfigError, IwmError
-from iwm_power_manager.files import atomic_write, check_number
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import check_number
 from iwm_power_manager.mdp.demand import source_of
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.policy import save_policy
 from iwm_power_manager.replay.demand import drive_source, read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import load_grid, targets
+from iwm_power_manager.tools.command import described, ended, write_json
 from iwm_power_manager.tools.options import several
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.learning import (
@@ -47,8 +47,6 @@ from iwm_sim.learning import (
     recorded_cycle,
 )
 from iwm_sim.study.names import cores
-
-DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
 _DESCRIPTION = """\
 Learn a policy from recorded driving, and keep it only if it is no worse than one of standard cycles.
@@ -80,12 +78,7 @@ exit codes: 0 done, 2 bad arguments or files, 130 interrupted
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
-    result = argparse.ArgumentParser(
-        prog="learn_policy",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    result = described("learn_policy", _DESCRIPTION, _EXAMPLES)
     result.add_argument("--vehicle", required=True, metavar="FILE", help="car, YAML (config/vehicles/)")
     result.add_argument("--bag", **several, required=True, metavar="BAG", help="recorded drives")
     result.add_argument("--friction", nargs="+", type=float, required=True, metavar="MU", help="one policy each")
@@ -121,22 +114,13 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument("--jobs", type=int, default=cores(), metavar="N", help="processes (default: one for each core)")
     result.add_argument("--json", metavar="FILE", help="write the numbers, too")
     result.add_argument("--quiet", action="store_true", help="print errors only")
-    result.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return result
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
-    try:
-        _learn(options)
-    except IwmError as error:
-        print(f"learn_policy: error: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        print("learn_policy: interrupted; nothing half-written is left", file=sys.stderr)
-        return INTERRUPTED
-    return DONE
+    return ended("learn_policy", lambda: _learn(options))
 
 
 def _learn(options: argparse.Namespace) -> None:
@@ -175,7 +159,7 @@ def _learn(options: argparse.Namespace) -> None:
         )
     if options.json:
         content = {"package_version": __version__, "idle_drive": vehicle.idle_drive, "roads": roads}
-        atomic_write(options.json, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+        write_json(options.json, content)
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -7,21 +7,20 @@ Exit codes: 0 every requirement is met; 1 one is not; 2 bad arguments or files; 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
-from iwm_power_manager.errors import IwmError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.share import share_path
+from iwm_power_manager.tools.command import ended, write_json
 from iwm_sim.road_report import page, text
 from iwm_sim.road_run import RoadResult, check_scenario
 from iwm_sim.scenario import FOLDER, load_scenario
 
-DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, FAILED = 0, 1
 
 
 def parser() -> argparse.ArgumentParser:
@@ -39,27 +38,24 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Drive and report; returns the exit code."""
     options = parser().parse_args(argv)
-    try:
-        names = options.scenario or sorted(str(path) for path in share_path(FOLDER).glob("*.yaml"))
-        scenarios = [load_scenario(name) for name in names]
-        settings = default_settings(options.strategy)
-        results: list[RoadResult] = []
-        for scenario in scenarios:
-            results.append(check_scenario(scenario, settings))
-            print(text(results[-1]), flush=True)
-        failed = [result.scenario.name for result in results if not result.passed]
-        print(f"{len(results) - len(failed)} of {len(results)} scenarios meet all they require")
-        if options.page:
-            atomic_write(options.page, page(results, options.strategy).encode())
-        if options.json:
-            values = {result.scenario.name: result.values for result in results}
-            atomic_write(options.json, (json.dumps(values, indent=2) + "\n").encode())
-    except IwmError as error:
-        print(f"roads: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    return FAILED if failed else DONE
+    return ended("roads", lambda: _drive(options))
+
+
+def _drive(options: argparse.Namespace) -> int:
+    names = options.scenario or sorted(str(path) for path in share_path(FOLDER).glob("*.yaml"))
+    scenarios = [load_scenario(name) for name in names]
+    settings = default_settings(options.strategy)
+    results: list[RoadResult] = []
+    for scenario in scenarios:
+        results.append(check_scenario(scenario, settings))
+        print(text(results[-1]), flush=True)
+    passed = sum(result.passed for result in results)
+    print(f"{passed} of {len(results)} scenarios meet all they require")
+    if options.page:
+        atomic_write(options.page, page(results, options.strategy).encode())
+    if options.json:
+        write_json(options.json, {result.scenario.name: result.values for result in results})
+    return DONE if passed == len(results) else FAILED
 
 
 if __name__ == "__main__":

@@ -86,6 +86,15 @@ def test_a_bag_is_split_by_size_and_reads_as_one(make_bag: Callable[..., Path]) 
         assert [t for _, t, _ in reader.messages()] == list(range(5000))
 
 
+def test_what_waits_in_memory_counts_for_a_file_s_size(make_bag: Callable[..., Path]) -> None:
+    path = make_bag(
+        [("/a", i, float(i)) for i in range(5000)], max_bytes=20_000, chunk_bytes=1 << 20, compression="none"
+    )
+    files = sorted(path.glob("*.mcap"))
+    assert len(files) > 5
+    assert all(file.stat().st_size < 30_000 for file in files)
+
+
 def test_a_bag_is_split_by_duration(make_bag: Callable[..., Path]) -> None:
     path = make_bag([("/a", i * 100, 0.0) for i in range(100)], max_duration_ns=1000)
     information = yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]

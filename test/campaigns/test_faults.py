@@ -34,41 +34,41 @@ class TestTransforms:
         assert list(relay.pass_on(message, 0.0)) == [message]
 
     def test_delayed_messages_come_later_and_in_order(self) -> None:
-        delay = relay.Delay(1.0)
+        delay = relay.delay(1.0)
         assert list(delay("a", 0.0)) == []
         assert list(delay("b", 0.5)) == []
         assert list(delay("c", 1.5)) == ["a", "b"]
         assert list(delay("d", 2.5)) == ["c"]
 
     def test_frozen_messages_keep_their_value_and_perhaps_their_stamp(self) -> None:
-        whole, restamped = relay.Freeze(restamp=False), relay.Freeze(restamp=True)
+        whole, restamped = relay.freeze(restamp=False), relay.freeze(restamp=True)
         for freeze, stamp in ((whole, 1), (restamped, 2)):
             list(freeze(speed(1, 7.0), 0.0))
             (frozen,) = freeze(speed(2, 8.0), 0.1)
             assert m.read_vehicle_speed(frozen) == (stamp, 7.0)
 
     def test_a_tenfold_rate_sends_ten_with_rising_stamps(self) -> None:
-        sent = list(relay.Repeat(10)(speed(100, 7.0), 0.0))
+        sent = list(relay.repeat(10)(speed(100, 7.0), 0.0))
         stamps = [m.read_vehicle_speed(message).stamp_ns for message in sent]
         assert len(set(stamps)) == 10
         assert stamps == sorted(stamps)
-        assert [message.data for message in relay.Repeat(3)(m.number_message(1.0), 0.0)] == [1.0] * 3
+        assert [message.data for message in relay.repeat(3)(m.number_message(1.0), 0.0)] == [1.0] * 3
 
     def test_a_tenth_of_the_rate_sends_every_tenth(self) -> None:
-        thin = relay.Thin(10)
+        thin = relay.thin(10)
         assert sum(len(list(thin("x", 0.0))) for _ in range(100)) == 10
 
     def test_losing_loses_about_its_share_and_always_the_same(self) -> None:
         counts = [
-            sum(len(list(lose("x", 0.0))) for _ in range(1000)) for lose in (relay.Lose(0.3, 1), relay.Lose(0.3, 1))
+            sum(len(list(lose("x", 0.0))) for _ in range(1000)) for lose in (relay.lose(0.3, 1), relay.lose(0.3, 1))
         ]
         assert counts[0] == counts[1]
         assert 600 < counts[0] < 800
 
     def test_stamps_shift(self) -> None:
-        (shifted,) = relay.Restamp(-1.0)(speed(3 * 10**9, 7.0), 0.0)
+        (shifted,) = relay.restamp(-1.0)(speed(3 * 10**9, 7.0), 0.0)
         assert m.read_vehicle_speed(shifted).stamp_ns == 2 * 10**9
-        (clock,) = relay.Restamp(5.0)(m.clock_message(10**9), 0.0)
+        (clock,) = relay.restamp(5.0)(m.clock_message(10**9), 0.0)
         assert m.stamp_to_ns(clock.clock) == 6 * 10**9
 
     @pytest.mark.parametrize("value", [math.inf, 1e7])
@@ -80,14 +80,14 @@ class TestTransforms:
             (battery, lambda x: x.percentage),
             (m.number_message(0.0), lambda x: x.data),
         ):
-            (replaced,) = relay.Replace(value)(message, 0.0)
+            (replaced,) = relay.replace(value)(message, 0.0)
             assert read(replaced) == value
 
     def test_wheels_are_shuffled_with_their_values_or_left_out(self) -> None:
-        (shuffled,) = relay.Wheels((2, 0, 3, 1))(WHEELS, 0.0)
+        (shuffled,) = relay.wheels((2, 0, 3, 1))(WHEELS, 0.0)
         assert m.select_by_name(m.read_wheel_speeds(shuffled), m.WHEEL_NAMES) == (1.0, 2.0, 3.0, 4.0)
         assert shuffled.name[0] == "rear_left"
-        (three,) = relay.Wheels((0, 1, 2))(WHEELS, 0.0)
+        (three,) = relay.wheels((0, 1, 2))(WHEELS, 0.0)
         assert list(three.velocity) == [1.0, 2.0, 3.0]
         assert list(three.effort) == [5.0, 6.0, 7.0]
 

@@ -324,6 +324,15 @@ class TestRecord:
             assert again == command
         assert sum(from_numbers(values).first for values in drive.steps) == 2
 
+    def test_reset_forgets_inputs_and_memory(self, drive) -> None:
+        drive.run(60, demand=9000.0)
+        drive.controller.reset()
+        monitor = drive.controller.monitor
+        assert not monitor.driven
+        assert (monitor.speed_mps, monitor.demand_w, monitor.wheel_speed_radps) == (0.0, 0.0, (0.0,) * 4)
+        assert drive.controller.state == initial_state()
+        assert drive.step()["stale"] != 0
+
     def test_settings_come_back_with_the_types_the_law_was_compiled_for(self, drive) -> None:
         settings_again = from_numbers(drive.run(1)).settings
         assert settings_again == default_settings("equal")

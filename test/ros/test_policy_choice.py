@@ -16,7 +16,7 @@ from iwm_power_manager.nodes.policy_choice import choose_policies
 from iwm_power_manager.policy import Policy, load_policy, save_policy
 from iwm_power_manager.ros.diagnostics import OK, WARN
 from iwm_power_manager.share import share_path
-from iwm_power_manager.vehicle import load_vehicle, with_idle_drive
+from iwm_power_manager.vehicle import load_vehicle
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"))
 RULE = [0.0, 0.5, 0.0, 0.5]
@@ -83,7 +83,7 @@ def test_the_identity_is_the_files_checksum(tmp_path) -> None:
 
 
 def test_a_policy_for_another_car_is_refused(tmp_path) -> None:
-    other = with_idle_drive(CAR, "enabled" if CAR.idle_drive != "enabled" else "none")
+    other = load_vehicle(CAR.path, "enabled" if CAR.idle_drive != "enabled" else "none")
     write_policy(tmp_path / "other.npz", 0.9, other)
     with pytest.raises(PolicyError, match="holds no policy for"):
         choose_policies(str(tmp_path), "sdp", "none", RULE, CAR)

@@ -290,3 +290,16 @@ def test_friction_may_come_from_its_topic_and_falls_back_when_that_is_stale(benc
     bench.drive(lambda: send_friction(0.31) or bench.last("friction") == 0.31, "the topic's friction")
     bench.drive(lambda: send_friction(NAN) or bench.last("friction") == 0.9, "the parameter's friction")
     assert bench.set_parameter("friction_source", "parameter") == ""
+
+
+def test_what_came_before_activation_is_forgotten(bench) -> None:
+    assert bench.set_parameter("friction", 0.9) == ""
+    assert bench.set_parameter("friction_source", "road_friction") == ""
+    assert bench.change_state("deactivate")
+    bench.publish(messages.ROAD_FRICTION, messages.number_message(0.31))
+    assert bench.publishers[messages.ROAD_FRICTION].wait_for_all_acked()
+    bench.states.clear()
+    assert bench.change_state("activate")
+    bench.drive(lambda: len(bench.states) > 5, "steps")
+    assert {state["friction"] for state in bench.states} == {0.9}
+    assert bench.set_parameter("friction_source", "parameter") == ""

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every command has in common: its parser, how it ends, and the files it leaves."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from iwm_power_manager import __version__
+from iwm_power_manager.errors import IwmError
+from iwm_power_manager.files import atomic_write
+
+DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
+
+
+def described(name: str, description: str, examples: str, *, abbreviated: bool = True) -> argparse.ArgumentParser:
+    """Parser of a command, with `--version` and examples as typed; whether options may be `abbreviated`."""
+    parser = argparse.ArgumentParser(
+        name,
+        description=description,
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=abbreviated,
+    )
+    parser.add_argument("--version", action="version", version=f"{name} {__version__}")
+    return parser
+
+
+def ended(name: str, work: Callable[[], int | None]) -> int:
+    """Exit code of a command's work; what is wrong with the user's input is one line."""
+    try:
+        return work() or DONE
+    except IwmError as error:
+        print(f"{name}: error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted; nothing half-written is left", file=sys.stderr)
+        return INTERRUPTED
+
+
+def write_json(path: Path | str, values: Any) -> None:
+    """Write plain values as JSON, atomically."""
+    atomic_write(path, (json.dumps(values, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_picture(path: Path | str, figure: Any) -> None:
+    """Write a matplotlib figure as PNG, atomically; the same figure gives the same bytes."""
+    import io
+
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
+    atomic_write(path, stream.getvalue())
