@@ -48,7 +48,6 @@ from iwm_sim.drive import Drive, save_run
 from iwm_sim.pacing import FRICTION, MOTOR, Exchange, NoAnswerError, Pacer
 from iwm_sim.scenario import Scenario, load_scenario, on_cycle
 
-RECORDER_READY = "recorder/ready"
 _NO_TORQUE: Wheels = (0.0, 0.0, 0.0, 0.0)
 #: Partners must have been seen for this long: the other side learns of a match a little later than this one.
 _SETTLE_S = 0.3
@@ -165,7 +164,10 @@ class Simulator(Node):
         self._simulated_time = self._lockstep or speed_factor != 1.0
         profile = qos.profile(lockstep=self._lockstep)
         topics = [m.VEHICLE_SPEED, m.WHEEL_STATES, m.BATTERY_STATE, m.POWER_DEMAND]
+        # On a drive cycle the car goes straight ahead.
+        self._moves_in_the_plane = bool(values["scenario_file"])
         optional = [m.ACCELERATOR_PEDAL, m.BRAKE_PEDAL] + ([m.CLOCK] if self._simulated_time else [])
+        optional += [m.DIRECTION, m.IMU] if self._moves_in_the_plane else []
         # Handlers of unmet quality of service would be waited for at every step; a missing match is told at the start.
         silent = PublisherEventCallbacks(use_default_callbacks=False)
         self._outputs: dict[str, Publisher] = {
@@ -177,7 +179,7 @@ class Simulator(Node):
         if values["wait_for_recorder"]:
             self._listeners = {topic: self._listeners.get(topic, 0) + 1 for topic in self._outputs}
             latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            self.create_subscription(Bool, RECORDER_READY, self._on_recorder, latched)
+            self.create_subscription(Bool, m.RECORDER_READY, self._on_recorder, latched)
         self._intake = Intake(self)
         self._intake.subscribe(JointState, m.WHEEL_TORQUE_COMMAND, profile)
         if self._lockstep:
@@ -355,6 +357,10 @@ class Simulator(Node):
                 capacity_ah=self._drive.capacity_ah,
             ),
         )
+        if self._moves_in_the_plane:
+            forward, left = sensors.acceleration_mps2, sensors.lateral_acceleration_mps2
+            self._publish(m.IMU, m.imu_message(stamp_ns, sensors.yaw_rate_radps, forward, left))
+            self._publish(m.DIRECTION, m.number_message(float(sensors.direction)))
         self._publish(m.POWER_DEMAND, m.number_message(sensors.power_demand_w))
 
     def _publish(self, topic: str, message: Any) -> None:

@@ -44,6 +44,7 @@ from iwm_power_manager.ros.messages import (
     FRICTION_BRAKE_COMMAND,
     POWER_DEMAND,
     POWER_MANAGER_STATE,
+    RECORDER_READY,
     TOPIC_TYPES,
     VEHICLE_SPEED,
     WHEEL_STATES,
@@ -57,7 +58,7 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.types import definition_of
 
 DIAGNOSTICS = "/diagnostics"
-DEFAULT_TOPICS = [*TOPIC_TYPES, DIAGNOSTICS]
+DEFAULT_TOPICS = [*(topic for topic in TOPIC_TYPES if topic != RECORDER_READY), DIAGNOSTICS]
 #: What a closed loop cannot run without: `~/ready` waits for these.
 DEFAULT_WAIT_FOR = [
     VEHICLE_SPEED,

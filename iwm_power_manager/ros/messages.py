@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TwistStamped
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import BatteryState, JointState
+from sensor_msgs.msg import BatteryState, Imu, JointState
 from std_msgs.msg import Float64
 
 from iwm_power_manager.control.monitor import (
@@ -26,6 +26,7 @@ from iwm_power_manager.control.monitor import (
 from iwm_power_manager.control.monitor import (
     select_by_name as select_by_name,  # part of this interface
 )
+from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.signals.contract import *  # noqa: F403 - names of topics and wheels: part of this interface
 from iwm_power_manager.signals.contract import TYPES
 
@@ -63,13 +64,26 @@ def clock_message(time_ns: int) -> Clock:
 
 
 def number_message(value: float) -> Float64:
-    """`power_demand` (W), `accelerator_pedal`, `brake_pedal` (0..1) or `road_friction`."""
+    """`power_demand` (W), `accelerator_pedal`, `brake_pedal` (0..1), `road_friction` or `direction`."""
     return Float64(data=value)
 
 
 def read_number(message: Float64) -> float:
     """Value of a Float64 message."""
     return float(message.data)
+
+
+def imu_message(stamp_ns: int, yaw_rate_radps: float, forward_mps2: float, left_mps2: float) -> Imu:
+    """`imu`: what a sensor in `base_link` of a level car reads; the orientation is not measured."""
+    message = Imu()
+    message.header.stamp = ns_to_stamp(stamp_ns)
+    message.header.frame_id = "base_link"
+    message.orientation_covariance[0] = -1.0
+    message.angular_velocity.z = yaw_rate_radps
+    message.linear_acceleration.x = forward_mps2
+    message.linear_acceleration.y = left_mps2
+    message.linear_acceleration.z = GRAVITY_MPS2
+    return message
 
 
 def vehicle_speed_message(stamp_ns: int, speed_mps: float, frame_id: str = "base_link") -> TwistStamped:

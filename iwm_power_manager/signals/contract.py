@@ -22,12 +22,15 @@ ACCELERATOR_PEDAL = "accelerator_pedal"
 BRAKE_PEDAL = "brake_pedal"
 BATTERY_STATE = "battery_state"
 ROAD_FRICTION = "road_friction"
+DIRECTION = "direction"
+IMU = "imu"
 WHEEL_TORQUE_COMMAND = "wheel_torque_command"
 FRICTION_BRAKE_COMMAND = "friction_brake_command"
 POWER_MANAGER_STATE = "power_manager/state"
 #: The same as the node itself names it: private, so that a renamed node has one of its own.
 NODE_STATE = "~/state"
 DIAGNOSTICS = "/diagnostics"
+RECORDER_READY = "recorder/ready"
 CLOCK = "/clock"
 
 
@@ -44,6 +47,7 @@ class Topic(NamedTuple):
     rate : how often it comes
     reliability : that the power manager asks for (in) or offers (out)
     loss : what the power manager does without it
+    durability : "volatile", or "transient_local" where the last message waits for those who come later
     """
 
     name: str
@@ -54,6 +58,7 @@ class Topic(NamedTuple):
     rate: str
     reliability: str
     loss: str
+    durability: str = "volatile"
 
 
 _STEP = "each control step"
@@ -110,6 +115,16 @@ TOPICS = (
         "the parameter `friction` counts",
     ),
     Topic(
+        DIRECTION,
+        FLOAT64,
+        "in",
+        f"{_CAR} (scenarios)",
+        "`data`: direction of travel the driver asks for, above 0 forwards, below reverse, 0 changes nothing; optional",
+        "any",
+        "best_effort",
+        "the last one counts; forwards before the first",
+    ),
+    Topic(
         WHEEL_TORQUE_COMMAND,
         JOINT_STATE,
         "out",
@@ -148,6 +163,27 @@ TOPICS = (
         "1 Hz, and at every change",
         "reliable",
         "",
+    ),
+    Topic(
+        IMU,
+        "sensor_msgs/msg/Imu",
+        "",
+        "simulator (scenarios)",
+        "`angular_velocity.z`, rad/s, and `linear_acceleration`, m/s2, of `base_link`: what a sensor there reads",
+        _STEP,
+        "reliable",
+        "",
+    ),
+    Topic(
+        RECORDER_READY,
+        "std_msgs/msg/Bool",
+        "",
+        "recorder",
+        "`data`: every topic it waits for is matched; nothing will be missed",
+        "at every change",
+        "reliable",
+        "",
+        "transient_local",
     ),
     Topic(ACCELERATOR_PEDAL, FLOAT64, "", "simulator", "`data`: accelerator pedal, 0..1", "10 Hz", "reliable", ""),
     Topic(BRAKE_PEDAL, FLOAT64, "", "simulator", "`data`: brake pedal, 0..1", "10 Hz", "reliable", ""),

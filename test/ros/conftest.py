@@ -30,7 +30,14 @@ class Pair:
 
     _count = 0
 
-    def __init__(self, folder: Path, parameters: dict[str, Any], *, sim_time: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        parameters: dict[str, Any],
+        *,
+        sim_time: bool = False,
+        environment: dict[str, str] | None = None,
+    ) -> None:
         Pair._count += 1
         domain = int(os.environ["ROS_DOMAIN_ID"])
         namespace = f"/test_{os.getpid()}_{Pair._count}"
@@ -38,12 +45,12 @@ class Pair:
         remaps = {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics", "/clock": f"{namespace}/clock"}
         given = {name.replace("{namespace}", namespace): value for name, value in parameters.items()}
         self.arguments = arguments({**EQUAL, **given, "use_sim_time": sim_time}, remaps)
-        self._folder, self._domain = folder, domain
+        self._folder, self._domain, self._environment = folder, domain, environment
         self.running = self.start()
 
     def start(self) -> Running:
         """Start the node (again)."""
-        self.running = Running(MODULE, self.arguments, self._domain, self._folder)
+        self.running = Running(MODULE, self.arguments, self._domain, self._folder, self._environment)
         return self.running
 
     def close(self) -> None:

@@ -5,18 +5,22 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
 from xml.etree import ElementTree
 
 import pytest
+from bench import Running, arguments
+from rcl_interfaces.srv import ListParameters
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, ReliabilityPolicy
 
 ROOT = Path(__file__).resolve().parents[2]
 INTERFACE = json.loads((ROOT / "docs" / "interface.json").read_text())
 RELIABILITIES = {"best_effort": ReliabilityPolicy.BEST_EFFORT, "reliable": ReliabilityPolicy.RELIABLE}
+DURABILITIES = {"volatile": DurabilityPolicy.VOLATILE, "transient_local": DurabilityPolicy.TRANSIENT_LOCAL}
 PERIOD_S = 0.01
 
 
@@ -54,42 +58,90 @@ def test_the_security_policies_allow_what_the_interface_names_and_nothing_else(m
     assert allowed["reply"] == {f"~/{name}" for name in services}
 
 
-def test_a_running_node_advertises_the_interface(start_pair) -> None:
-    bench = start_pair().bench
-    bench.connect()
+def qualified(name: str, namespace: str, node: str) -> str:
+    """A name of the interface as it is on a domain where `/diagnostics` and `/clock` live in the namespace, too."""
+    if name.startswith("~"):
+        return name.replace("~", f"{namespace}/{node}")
+    return f"{namespace}/{name.lstrip('/')}"
+
+
+@pytest.fixture(scope="module")
+def all_three(start_pair, tmp_path_factory):
+    """Simulator and recorder beside a power manager, each in a process of its own; the bench looks on."""
+    pair = start_pair()
+    namespace = pair.bench.node.get_namespace()
+    folder = tmp_path_factory.mktemp("three")
+    remaps = {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics", "/clock": f"{namespace}/clock"}
+    domain = int(os.environ["ROS_DOMAIN_ID"])
+    scenario = {"scenario_file": "stop_09", "speed_factor": 2.0, "wait_for_recorder": True}
+    runs = [
+        Running("iwm_sim.simulator", arguments(scenario, remaps), domain, folder),
+        Running("iwm_power_manager.nodes.recorder", arguments({"output": folder / "bag"}, remaps), domain, folder),
+    ]
+    yield pair.bench
+    for run in runs:
+        run.process.kill()
+        run.process.wait()
+
+
+@pytest.mark.parametrize("name", ["power_manager", "simulator", "recorder"])
+def test_a_running_node_advertises_the_interface(all_three, name: str) -> None:
+    bench = all_three
     node, namespace = bench.node, bench.node.get_namespace()
+    known = {qualified(t["name"], namespace, "power_manager"): t for t in INTERFACE["topics"]}
 
     def mine(infos):
-        return [info for info in infos if (info.node_name, info.node_namespace) == ("power_manager", namespace)]
+        return [info for info in infos if (info.node_name, info.node_namespace) == (name, namespace)]
 
     shown = set()
-    for topic in (topic for topic in INTERFACE["topics"] if topic["direction"]):
-        name = topic["name"].replace("~", f"{namespace}/power_manager")
-        name = f"{namespace}/diagnostics" if name == "/diagnostics" else name
-        name = name if name.startswith("/") else f"{namespace}/{name}"
-        ask = node.get_publishers_info_by_topic if topic["direction"] == "out" else node.get_subscriptions_info_by_topic
-        (info,) = bench.spin_until(lambda ask=ask, name=name: mine(ask(name)), name)
-        shown.add(name)
-        assert info.topic_type == topic["type"]
-        assert str(info.topic_type_hash) == topic["type_hash"]
-        qos = topic["qos"]
-        assert info.qos_profile.reliability == RELIABILITIES[qos["reliability"]]
-        assert info.qos_profile.durability == DurabilityPolicy.VOLATILE
-        if qos["deadline_periods"]:
-            assert info.qos_profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC
-            assert info.qos_profile.deadline == Duration(seconds=qos["deadline_periods"] * PERIOD_S)
-            assert info.qos_profile.liveliness_lease_duration == Duration(seconds=qos["lease_periods"] * PERIOD_S)
-        else:
-            assert info.qos_profile.liveliness == LivelinessPolicy.AUTOMATIC
+    for direction, ask in (
+        ("publishes", node.get_publishers_info_by_topic),
+        ("subscribes", node.get_subscriptions_info_by_topic),
+    ):
+        for topic in INTERFACE["nodes"][name][direction]:
+            if topic in ("~/transition_event", "/clock") and name == "power_manager":
+                continue  # rclpy's own, the second only with use_sim_time
+            full = qualified(topic, namespace, name)
+            (info,) = bench.spin_until(lambda ask=ask, full=full: mine(ask(full)), f"{name} on {full}")
+            shown.add(full)
+            meant = known[full]
+            assert (info.topic_type, str(info.topic_type_hash)) == (meant["type"], meant["type_hash"])
+            # Of an input the interface says what is asked for, of all else what is offered.
+            if name == "power_manager" or (direction == "publishes" and meant["direction"] != "in"):
+                check_quality(info.qos_profile, meant["qos"])
     # Nothing is there that the interface does not name.
-    own = {"/rosout", "/parameter_events", f"{namespace}/power_manager/transition_event"}
-    published = {name for name, _ in node.get_publisher_names_and_types_by_node("power_manager", namespace)}
-    subscribed = {name for name, _ in node.get_subscriber_names_and_types_by_node("power_manager", namespace)}
+    own = {"/rosout", "/parameter_events", f"{namespace}/{name}/transition_event"}
+    published = {found for found, _ in node.get_publisher_names_and_types_by_node(name, namespace)}
+    subscribed = {found for found, _ in node.get_subscriber_names_and_types_by_node(name, namespace)}
     assert (published | subscribed) - shown <= own
-    services = dict(node.get_service_names_and_types_by_node("power_manager", namespace))
+    services = dict(node.get_service_names_and_types_by_node(name, namespace))
     expected = {
-        f"{namespace}/power_manager/{service['name']}": [service["type"]]
+        f"{namespace}/{name}/{service['name']}": [service["type"]]
         for service in INTERFACE["services"]
-        if service["node"] == "power_manager"
+        if service["node"] == name
     }
     assert {name: kinds for name, kinds in services.items() if "type_description" not in name} == expected
+
+
+def check_quality(found, meant) -> None:
+    assert found.reliability == RELIABILITIES[meant["reliability"]]
+    assert found.durability == DURABILITIES[meant["durability"]]
+    if meant["deadline_periods"]:
+        assert found.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC
+        assert found.deadline == Duration(seconds=meant["deadline_periods"] * PERIOD_S)
+        assert found.liveliness_lease_duration == Duration(seconds=meant["lease_periods"] * PERIOD_S)
+    else:
+        assert found.liveliness == LivelinessPolicy.AUTOMATIC
+
+
+@pytest.mark.parametrize("name", ["power_manager", "simulator", "recorder"])
+def test_a_running_node_has_the_parameters_of_the_interface(all_three, name: str) -> None:
+    bench = all_three
+    own = ("qos_overrides.", "use_sim_time", "start_type_description_service")
+    request = ListParameters.Request()
+    client = bench.node.create_client(ListParameters, f"{name}/list_parameters")
+    bench.spin_until(client.service_is_ready, "the service")
+    future = client.call_async(request)
+    bench.spin_until(future.done, "the answer")
+    found = {parameter for parameter in future.result().result.names if not parameter.startswith(own)}
+    assert found == {parameter["name"] for parameter in INTERFACE["parameters"][name]}

@@ -17,8 +17,11 @@ from rolling_car import Heard, RollingCar
 
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.control.thresholds import Thresholds
+from iwm_sim.campaigns import soak
 
 T = Thresholds()
+#: Shared memory of Fast DDS does not survive that a process is stopped for a second: see docs/safety.md.
+UDP = soak.without_shared_memory({})
 DRIVE_W, BRAKE_W = 5000.0, -6000.0
 NS_PER_S = 1e9
 
@@ -77,7 +80,10 @@ def check(found: Hold, brakes: bool) -> None:
     steps = [h for h in found.motors if h.stamp_ns >= found.ended_ns]
     longest_s = T.longest_step_periods * 0.01
     for before, after in itertools.pairwise(steps):
-        assert max(after.torque_nm, 0.0) - max(before.torque_nm, 0.0) <= 4.0 * DEFAULTS.slew_up_nmps * longest_s
+        # A queue of one loses commands on a busy machine: then there is more time between two of them.
+        passed_s = max((after.stamp_ns - before.stamp_ns) / NS_PER_S, longest_s)
+        rise_nm = max(after.torque_nm, 0.0) - max(before.torque_nm, 0.0)
+        assert rise_nm <= 4.0 * DEFAULTS.slew_up_nmps * passed_s + 1e-6
     if found.length_s > 1.2 * T.own_gap_s:
         # It starts over: no torque until inputs have been good again.
         began_ns = steps[0].stamp_ns
@@ -88,7 +94,7 @@ def check(found: Hold, brakes: bool) -> None:
 
 
 def run(start_pair, count: int, seed: int) -> list[Hold]:
-    pair = start_pair()
+    pair = start_pair(environment=UDP)
     pair.bench.connect()
     car = RollingCar(pair.bench, 10.0)
     source = random.Random(seed)

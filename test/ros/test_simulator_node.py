@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -23,7 +24,7 @@ from iwm_power_manager.ros import messages as m
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import simulator
-from iwm_sim.drive import Drive, load_run
+from iwm_sim.drive import Drive, RoadRow, load_run
 from iwm_sim.scenario import on_cycle
 from iwm_sim.simulator import PARAMETERS
 
@@ -412,3 +413,32 @@ def test_a_scenario_is_driven_as_its_file_says(tmp_path: Path, stand_in: Callabl
     assert 1.0 < run.final.distance_m < 15.0
     assert run.road is not None
     assert set(run.road[0, -6:-2]) == {0.2, 0.9}
+
+
+@pytest.mark.parametrize(("scenario", "direction"), [("split_stop", 1.0), ("hill_start_reverse", -1.0)])
+def test_in_a_scenario_it_shows_the_direction_asked_for_and_what_an_imu_reads(
+    stand_in: Callable[..., StandIn], scenario: str, direction: float
+) -> None:
+    car = stand_in(scenario_file=scenario, rate_hz=50.0, until_s=1.0)
+    right_brakes = (-10.0, -200.0, 0.0, 0.0)
+    car.answer = lambda stamp_ns, speed_mps, power_w: car.command(stamp_ns, (0.0,) * 4, right_brakes)
+    run, _ = car.run()
+    assert run.road is not None
+    columns = RoadRow._fields
+    yaw = run.road[:, columns.index("yaw_rate_radps")]
+    assert {message.data for message in car.received[m.DIRECTION]} == {direction}
+    shown = car.received[m.IMU]
+    assert [message.angular_velocity.z for message in shown] == list(yaw)
+    assert [m.stamp_to_ns(message.header.stamp) for message in shown] == stamps(car, m.VEHICLE_SPEED)
+    if scenario == "split_stop":
+        assert yaw[-1] < -0.001  # to the right
+        assert shown[-1].linear_acceleration.x < -0.1
+    else:
+        assert shown[0].linear_acceleration.x == pytest.approx(-9.81 * math.sin(math.atan(0.1)), rel=1e-3)
+    assert shown[0].linear_acceleration.z == pytest.approx(9.81, rel=1e-3)
+
+
+def test_on_a_cycle_the_car_goes_straight_ahead(stand_in: Callable[..., StandIn]) -> None:
+    car = stand_in(rate_hz=50.0, until_s=0.2)
+    car.run()
+    assert not car.received[m.DIRECTION] and not car.received[m.IMU]
