@@ -20,8 +20,10 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from bags_helpers import float64, topic
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.recover import recover
+from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.errors import BagError
 
 COUNT = 400
@@ -145,6 +147,19 @@ def test_a_damaged_chunk_is_left_out_named_and_the_original_kept(tmp_path: Path,
     text = "\n".join(report.lines())
     assert "1 chunk(s) unreadable" in text
     assert f"/a: {lost} messages missing in between" in text
+
+
+def test_each_topic_s_messages_are_counted_by_its_own_publisher_in_files_and_between_them(tmp_path: Path) -> None:
+    path = tmp_path / "bag"
+    with BagWriter(path, WriterOptions(max_duration_ns=1000)) as bag:
+        fast, slow = bag.add_topic(topic("/fast")), bag.add_topic(topic("/slow"))
+        for step in range(35):
+            if step not in (4, 5, 10):  # two within the first file, and the second file's first
+                bag.write(fast, step * 100, float64(0.0), step * 100, step + 1)
+            if step % 5 == 0:
+                bag.write(slow, step * 100 + 1, float64(0.0), step * 100 + 1, 700 + step // 5)
+    (path / "metadata.yaml").unlink()
+    assert recover(path).missing == {"/fast": 3}
 
 
 def test_a_whole_bag_is_left_as_it_is(make_bag: Callable[..., Path]) -> None:

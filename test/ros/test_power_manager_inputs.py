@@ -301,5 +301,10 @@ def test_what_came_before_activation_is_forgotten(bench) -> None:
     bench.states.clear()
     assert bench.change_state("activate")
     bench.drive(lambda: len(bench.states) > 5, "steps")
+    # Any change of a parameter makes the node choose its friction anew.
+    assert bench.set_parameter("friction_timeout_s", 600.0) == ""
+    bench.states.clear()
+    bench.drive(lambda: len(bench.states) > 5, "more steps")
     assert {state["friction"] for state in bench.states} == {0.9}
     assert bench.set_parameter("friction_source", "parameter") == ""
+    assert bench.set_parameter("friction_timeout_s", 2.0) == ""
