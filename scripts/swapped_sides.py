@@ -81,6 +81,10 @@ def _pairs(text: _Text, elements: list[ast.expr], wheels: bool) -> Iterator[tupl
                 yield one, other
 
 
+def _is_shape(node: ast.expr) -> bool:
+    return isinstance(node, ast.Attribute) and node.attr == "shape"
+
+
 def swaps_of(source: str) -> list[str]:
     """The source with one swap each, in the order of their places."""
     text = _Text(source)
@@ -101,7 +105,7 @@ def swaps_of(source: str) -> list[str]:
             end = text.span(node)[1]
             start = end - len(name.encode())
             found += [text.replaced(start, end, other) for other in sorted(_other_names(name) & known)]
-        elif isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
+        elif isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant) and not _is_shape(node.value):
             index = node.slice.value
             if type(index) is int and 0 <= index < _WHEELS:
                 found += [text.replaced(*text.span(node.slice), str(index ^ bit)) for bit in (1, 2)]
