@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import dis
 import gc
 import hashlib
+import itertools
 import pickle
 import time
 from collections.abc import Sequence
@@ -18,6 +20,7 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
+from numba.core.types import Array
 from numba.core.types.containers import BaseNamedTuple, BaseTuple
 from numba.core.types.misc import unliteral
 
@@ -52,8 +55,33 @@ class Use(NamedTuple):
 USES: list[Use] = []
 
 
+#: What kernels use of NumPy that makes no array.
+_SCALAR = frozenset({"float32", "float64", "inf", "int16", "int32", "int64", "searchsorted"})
+
+
+def _makes_arrays(kernel: Kernel) -> bool:
+    """Whether a kernel may make an array of its own: whether it uses of NumPy what is not `_SCALAR`."""
+    code = list(dis.get_instructions(kernel.py_func))
+    return any(
+        use.argval not in _SCALAR
+        for module, use in itertools.pairwise(code)
+        if module.opname == "LOAD_GLOBAL" and module.argval == "np"
+    )
+
+
 def _options(kernel: Kernel) -> dict[str, Any]:
-    return {"nopython": True, "error_model": "numpy", "nogil": kernel.releases_lock}
+    """Numba's options for a kernel.
+
+    References are counted only where arrays are made. Whoever calls a kernel holds its arrays until it returns; numba
+    would count them all the same, at every call and for every array of a car and a policy, with atomic operations that
+    take longer than the arithmetic.
+    """
+    return {
+        "nopython": True,
+        "error_model": "numpy",
+        "nogil": kernel.releases_lock,
+        "_nrt": _makes_arrays(kernel),
+    }
 
 
 class _Code(JITCodeLibrary):
@@ -75,6 +103,10 @@ class _PartCompiler(Compiler):
         super().__init__(typing, target, library or _Code(target.codegen(), "part"), args, result, flags, names)
 
 
+def _holds_arrays(kind: Any) -> bool:
+    return isinstance(kind, Array) or (isinstance(kind, BaseTuple) and any(map(_holds_arrays, kind.types)))
+
+
 class _Part(CPUDispatcher):
     """A kernel as other kernels call it."""
 
@@ -85,6 +117,10 @@ class _Part(CPUDispatcher):
 
     def add_overload(self, result: CompileResult) -> None:
         """Let callers find what was compiled; there is nothing that Python could call."""
+        if _holds_arrays(result.signature.return_type):  # with whose reference?
+            raise TypeError(
+                f"{self.py_func.__qualname__} returns arrays to another kernel: let it fill what it is given"
+            )
         result = result._replace(entry_point=_EntryPoint())
         self.targetctx.insert_user_function(result.entry_point, result.fndesc, [result.library])
         self.overloads[tuple(result.signature.args)] = result

@@ -31,7 +31,7 @@ import numpy as np
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n, rolling_force_n
 from iwm_power_manager.model.longitudinal import Four
-from iwm_power_manager.model.parameters import Axle, Tyre, VehicleParams, Wheel
+from iwm_power_manager.model.parameters import Tyre, VehicleParams, Wheel
 from iwm_power_manager.model.tyre import friction_and_slope, peak_ratio
 
 #: Below this speed of car and rims, m/s, a car that can be held is at rest.
@@ -211,11 +211,6 @@ def loads_n(
 
 
 @kernel
-def _axle(i: int, vehicle: VehicleParams) -> Axle:
-    return vehicle.front if i < 2 else vehicle.rear
-
-
-@kernel
 def wheel_places_m(vehicle: VehicleParams) -> tuple[Four, Four]:
     """Where the wheels stand, forward and to the left of the centre of gravity, m."""
     a = vehicle.chassis.front_axle_to_cg_m
@@ -309,7 +304,7 @@ def _holds(
     capacity = rolling_force_n(0.0, vehicle.chassis)
     driving = -pull_n
     for i in range(4):
-        axle = _axle(i, vehicle)
+        axle = vehicle.front if i < 2 else vehicle.rear
         radius = axle.wheel.radius_m
         grip = on.friction[i] * peak_ratio(axle.tyre) * load[i]
         if radius * abs(wheels[i]) > REST_MPS or abs(on.motor_nm[i]) > on.resisting_nm[i] + radius * grip:
@@ -339,14 +334,14 @@ def _at_rest(
     whole = 0.0
     held = np.zeros(4)
     for i in range(4):
-        axle = _axle(i, vehicle)
+        axle = vehicle.front if i < 2 else vehicle.rear
         held[i] = min(on.friction[i] * peak_ratio(axle.tyre) * load[i], on.resisting_nm[i] / axle.wheel.radius_m)
         whole += held[i]
         left -= on.motor_nm[i] / axle.wheel.radius_m
     work = -0.5 * braked * speed_mps
     work += 0.5 * (mass * lateral_mps * lateral_mps + chassis.yaw_inertia_kgm2 * yaw_rate_radps**2) / dt_s
     for i in range(4):
-        wheel = _axle(i, vehicle).wheel
+        wheel = (vehicle.front if i < 2 else vehicle.rear).wheel
         share = held[i] / whole if whole > 0.0 else 0.25
         force = on.motor_nm[i] / wheel.radius_m + share * left
         held[i] = wheel.radius_m * force - on.motor_nm[i] - wheel.inertia_kgm2 * wheels[i] / dt_s
@@ -387,7 +382,7 @@ def _tyres(before: Four, v_x, v_y, rate, load: Four, on: _Surface, dt_s, vehicle
     total_y = 0.0
     moment = 0.0
     for i in range(4):
-        axle = _axle(i, vehicle)
+        axle = vehicle.front if i < 2 else vehicle.rear
         radius = axle.wheel.radius_m
         c = on.cosine[i]
         s = on.sine[i]
@@ -435,7 +430,7 @@ def _slip_work_w(before: Four, mean_x, mean_y, mean_rate, on: _Surface, vehicle,
     work = 0.0
     for i in range(4):
         along, across = _over_ground(i, mean_x, mean_y, mean_rate, on)
-        rim = _axle(i, vehicle).wheel.radius_m * 0.5 * (before[i] + wheels[i])
+        rim = (vehicle.front if i < 2 else vehicle.rear).wheel.radius_m * 0.5 * (before[i] + wheels[i])
         work += force[i, 0] * (rim - along) - force[i, 1] * across
     return work
 
@@ -443,7 +438,7 @@ def _slip_work_w(before: Four, mean_x, mean_y, mean_rate, on: _Surface, vehicle,
 @kernel
 def _held_nm(i: int, before: Four, on: _Surface, dt_s, vehicle, wheels, force):
     """What brake and drag exerted on a wheel: with this torque eq. 11 holds exactly, whatever the iteration left."""
-    wheel = _axle(i, vehicle).wheel
+    wheel = (vehicle.front if i < 2 else vehicle.rear).wheel
     turning = wheel.inertia_kgm2 * (wheels[i] - before[i]) / dt_s
     return turning + wheel.radius_m * force[i, 0] - on.motor_nm[i]
 

@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
 import pickle
 import subprocess
 import sys
 from pathlib import Path
+
+import numpy as np
+import pytest
 
 from iwm_power_manager import jit
 from iwm_power_manager.grid import locate
@@ -29,8 +33,6 @@ def fill(out, b):
 
 
 def test_a_kernel_gives_the_same_from_python_and_inside_another_one(monkeypatch) -> None:
-    import numpy as np
-
     out = np.empty(5)
     fill(out, 4.0)
     assert out.tolist() == [hypotenuse(float(i), 4.0) for i in range(5)]
@@ -55,3 +57,28 @@ def test_without_the_compiler_a_kernel_is_the_plain_function(monkeypatch) -> Non
 def test_importing_kernels_imports_no_compiler() -> None:
     code = "import sys, iwm_power_manager.control.law, iwm_sim.closed_loop; sys.exit('numba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+@kernel
+def handed_back(axes):
+    return axes
+
+
+@kernel
+def first_of(axes) -> float:
+    return handed_back(axes)[0][0]
+
+
+def test_a_kernel_that_returns_arrays_to_another_one_is_refused() -> None:
+    # References are not counted between kernels: nobody would own them.
+    with pytest.raises(Exception, match="returns arrays to another kernel"):
+        first_of((np.ones(2), np.ones(3)))
+
+
+def test_python_still_owns_its_arrays_after_a_kernel() -> None:
+    axes = (np.arange(1000.0), np.ones(3))
+    counts = [sys.getrefcount(axis) for axis in axes]
+    for _ in range(100):
+        assert handed_back(axes)[0][-1] == 999.0
+    gc.collect()
+    assert [sys.getrefcount(axis) for axis in axes] == counts

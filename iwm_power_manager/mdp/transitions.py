@@ -11,8 +11,13 @@ from iwm_power_manager.jit import kernel, parallel_kernel
 from iwm_power_manager.mdp.policy_iteration import Model, list_cells
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.mdp.threads import over_ranges
-from iwm_power_manager.model.decision import axles_gated, step_cost_and_next
+from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
+from iwm_power_manager.model.decision import axles_gated, step_near, wheel_speed_of_state
 from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.two_axles import Speeds, curve_of
+
+#: Newton's method does not start from a car at rest, m/s.
+_SLOW_MPS = 0.05
 
 
 @kernel
@@ -38,38 +43,80 @@ def _store(outcome, i, speed_mps, slip_front, slip_rear, cost, corner, fraction)
     fraction[i, 2] = fc
 
 
+@kernel
+def _rolling_guess(power_w, speed_mps, vehicle, problem):
+    """Where a car whose wheels roll would be after a step: what Newton's method starts from."""
+    force = power_w / max(speed_mps, vehicle.driver.power_speed_floor_mps)
+    gained = problem.dt_s * (force - road_load_n(speed_mps, 0.0, vehicle.chassis)) / equivalent_mass_kg(vehicle)
+    car = max(speed_mps + gained, 0.5 * speed_mps, _SLOW_MPS)
+    return Speeds(car, car / vehicle.front.wheel.radius_m, car / vehicle.rear.wheel.radius_m)
+
+
+@kernel
+def _beyond(now, last):
+    """The next of a row of speeds that change evenly."""
+    if 2.0 * now.car_mps <= last.car_mps or 2.0 * now.front_radps <= last.front_radps:
+        return now
+    if 2.0 * now.rear_radps <= last.rear_radps:
+        return now
+    return Speeds(
+        2.0 * now.car_mps - last.car_mps,
+        2.0 * now.front_radps - last.front_radps,
+        2.0 * now.rear_radps - last.rear_radps,
+    )
+
+
+@kernel
+def _turning_alike(i, slip, speed_mps, axle):
+    """Last slip of the axis at which the wheel turns as at the i-th: at rest, wheels that brake all stand."""
+    while i + 1 < slip.size and wheel_speed_of_state(slip[i + 1], speed_mps, axle) == wheel_speed_of_state(
+        slip[i], speed_mps, axle
+    ):
+        i += 1
+    return i
+
+
+@kernel
+def _first_of_its_kind(state, p, start, cell, speed_mps, slip_front, slip_rear, vehicle):
+    """Of the states that differ in the name of their slips only, the one that is tabulated; the others are copies."""
+    n_r = slip_rear.size
+    plane = slip_front.size * n_r
+    c = cell[state]
+    v = c // plane
+    f = _turning_alike(c // n_r % slip_front.size, slip_front, speed_mps[v], vehicle.front)
+    r = _turning_alike(c % n_r, slip_rear, speed_mps[v], vehicle.rear)
+    wanted = v * plane + f * n_r + r
+    if wanted == c:
+        return state
+    found = start[p] + np.searchsorted(cell[start[p] : start[p + 1]], wanted)
+    return found if found < start[p + 1] and cell[found] == wanted else state
+
+
 @parallel_kernel
-def _fill_free(
-    power_w,
-    speed_mps,
-    slip_front,
-    slip_rear,
-    share,
-    vehicle,
-    problem,
-    start,
-    cell,
-    first_state,
-    last_state,
-    cost,
-    corner,
-    fraction,
-):
+def _fill_free(axes, share, vehicle, problem, start, cell, first_state, last_state, cost, corner, fraction):
+    power_w, speed_mps, slip_front, slip_rear = axes
     n_u = share.size
-    plane = slip_front.size * slip_rear.size
+    n_r = slip_rear.size
+    plane = slip_front.size * n_r
     shortfall = np.empty(n_u)
+    curves = (curve_of(problem.friction, vehicle.front), curve_of(problem.friction, vehicle.rear))
     for state in range(first_state, last_state):
         p = np.searchsorted(start, state, side="right") - 1
+        if _first_of_its_kind(state, p, start, cell, speed_mps, slip_front, slip_rear, vehicle) != state:
+            continue
         first = start[p]
         n = start[p + 1] - first
         c = cell[state]
-        v = speed_mps[c // plane]
-        f = slip_front[c // slip_rear.size % slip_front.size]
-        r = slip_rear[c % slip_rear.size]
+        v, f, r = speed_mps[c // plane], slip_front[c // n_r % slip_front.size], slip_rear[c % n_r]
+        guess = _rolling_guess(power_w[p], v, vehicle, problem)
+        last = guess
         least = np.inf
         for u in range(n_u):
             i = first * n_u + u * n + state - first
-            outcome = step_cost_and_next(power_w[p], v, f, r, share[u], vehicle, problem)
+            outcome, speeds = step_near(power_w[p], v, f, r, share[u], guess, curves, vehicle, problem)
+            # Shares follow each other: so do the solutions.
+            guess = _beyond(speeds, last) if u > 0 else speeds
+            last = speeds
             _store(outcome, i, speed_mps, slip_front, slip_rear, cost, corner, fraction)
             shortfall[u] = outcome.shortfall_w
             least = min(least, outcome.shortfall_w)
@@ -80,29 +127,34 @@ def _fill_free(
 
 
 @parallel_kernel
-def _fill_gated(
-    power_w,
-    speed_mps,
-    slip_front,
-    slip_rear,
-    vehicle,
-    problem,
-    start,
-    cell,
-    first_state,
-    last_state,
-    cost,
-    corner,
-    fraction,
-):
-    plane = slip_front.size * slip_rear.size
+def _copy_alike(axes, n_u, vehicle, start, cell, first_state, last_state, cost, corner, fraction):
+    _, speed_mps, slip_front, slip_rear = axes
+    for state in range(first_state, last_state):
+        p = np.searchsorted(start, state, side="right") - 1
+        source = _first_of_its_kind(state, p, start, cell, speed_mps, slip_front, slip_rear, vehicle)
+        if source != state:
+            first = start[p]
+            n = start[p + 1] - first
+            for u in range(n_u):
+                to, of = first * n_u + u * n + state - first, first * n_u + u * n + source - first
+                cost[to] = cost[of]
+                corner[to] = corner[of]
+                for axis in range(3):
+                    fraction[to, axis] = fraction[of, axis]
+
+
+@parallel_kernel
+def _fill_gated(axes, vehicle, problem, start, cell, first_state, last_state, cost, corner, fraction):
+    power_w, speed_mps, slip_front, slip_rear = axes
+    n_r = slip_rear.size
+    plane = slip_front.size * n_r
+    curves = (curve_of(problem.friction, vehicle.front), curve_of(problem.friction, vehicle.rear))
     for state in range(first_state, last_state):
         p = np.searchsorted(start, state, side="right") - 1
         c = cell[state]
-        v = speed_mps[c // plane]
-        f = slip_front[c // slip_rear.size % slip_front.size]
-        r = slip_rear[c % slip_rear.size]
-        outcome = step_cost_and_next(power_w[p], v, f, r, 0.5, vehicle, problem)
+        v, f, r = speed_mps[c // plane], slip_front[c // n_r % slip_front.size], slip_rear[c % n_r]
+        guess = _rolling_guess(power_w[p], v, vehicle, problem)
+        outcome, _ = step_near(power_w[p], v, f, r, 0.5, guess, curves, vehicle, problem)
         _store(outcome, state, speed_mps, slip_front, slip_rear, cost, corner, fraction)
 
 
@@ -136,17 +188,21 @@ def build_model(problem: Problem, vehicle: VehicleParams, friction: float, deman
         return np.empty(n), np.empty(n, np.int32), np.empty((n, 3))
 
     free = empty(free_cell.size * problem.share.size)
-    over_ranges(
-        free_cell.size,
-        lambda first, last: _fill_free(
-            *axes, problem.share, vehicle, params, free_start, free_cell, first, last, *free
-        ),
-    )
+
+    def fill_free(first: int, last: int) -> None:
+        _fill_free(axes, problem.share, vehicle, params, free_start, free_cell, first, last, *free)
+
+    def copy_alike(first: int, last: int) -> None:
+        _copy_alike(axes, problem.share.size, vehicle, free_start, free_cell, first, last, *free)
+
+    over_ranges(free_cell.size, fill_free)
+    over_ranges(free_cell.size, copy_alike)
     gated = empty(gated_cell.size)
-    over_ranges(
-        gated_cell.size,
-        lambda first, last: _fill_gated(*axes, vehicle, params, gated_start, gated_cell, first, last, *gated),
-    )
+
+    def fill_gated(first: int, last: int) -> None:
+        _fill_gated(axes, vehicle, params, gated_start, gated_cell, first, last, *gated)
+
+    over_ranges(gated_cell.size, fill_gated)
     return Model(
         problem.discount,
         np.ascontiguousarray(demand, dtype=np.float64),

@@ -15,11 +15,11 @@ from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.gate import axle_gated, gated_split
 from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
-from iwm_power_manager.model.longitudinal import step
 from iwm_power_manager.model.motor import idle_drag_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.model.quasi_steady import USABLE_FRICTION, demand_force_n, split_outcome_w
 from iwm_power_manager.model.torque import blend, conversion_speed_radps
+from iwm_power_manager.model.two_axles import UNSURE, Curve, Moved, Speeds, Torques, step_from
 from iwm_power_manager.model.tyre import peak_ratio, slip_ratio
 
 #: Where the delivered power is measured: torque times speed at the wheel (sees no power lost in slip), or at the
@@ -156,7 +156,32 @@ def step_cost_and_next(
     """
     if problem.slip_model == SLIP_QUASI_STEADY:
         return _quasi_steady_step(power_demand_w, speed_mps, front_share, vehicle, problem)
-    return _dynamic_step(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
+    start = given(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
+    moved = step_from(start.before, start.torques, start.before, problem.friction, UNSURE, problem.dt_s, vehicle)
+    return outcome_of(power_demand_w, start, moved, vehicle, problem)
+
+
+@kernel
+def step_near(
+    power_demand_w: float,
+    speed_mps: float,
+    slip_front: float,
+    slip_rear: float,
+    front_share: float,
+    guess: Speeds,
+    curves: tuple[Curve, Curve],
+    vehicle: VehicleParams,
+    problem: ProblemParams,
+) -> tuple[Step, Speeds]:
+    """`step_cost_and_next` where the speeds at its end are known nearly, and these speeds.
+
+    `guess` and `curves` : see `two_axles.step_from`; not used where slip is settled.
+    """
+    if problem.slip_model == SLIP_QUASI_STEADY:
+        return _quasi_steady_step(power_demand_w, speed_mps, front_share, vehicle, problem), guess
+    start = given(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
+    moved = step_from(start.before, start.torques, guess, problem.friction, curves, problem.dt_s, vehicle)
+    return outcome_of(power_demand_w, start, moved, vehicle, problem), moved.speeds
 
 
 @kernel
@@ -177,8 +202,21 @@ def _axle_torque(
     return motor, max(friction, -axle.friction_brake.max_torque_nm), 0.0
 
 
+class Given(NamedTuple):
+    """What a dynamic step starts from, whatever becomes of it: speeds, and what acts on a wheel of each axle, N m.
+
+    `front_drag_nm` and `rear_drag_nm` are the part of the resisting torques that an idle motor drags with.
+    """
+
+    before: Speeds
+    torques: Torques
+    front_drag_nm: float
+    rear_drag_nm: float
+    shortfall_w: float
+
+
 @kernel
-def _dynamic_step(
+def given(
     power_demand_w: float,
     speed_mps: float,
     slip_front: float,
@@ -186,10 +224,10 @@ def _dynamic_step(
     front_share: float,
     vehicle: VehicleParams,
     problem: ProblemParams,
-) -> Step:
+) -> Given:
+    """Torques of a dynamic step at a state under a front share, after gate and limits."""
     battery = vehicle.battery
     floor = vehicle.driver.power_speed_floor_mps
-    dt = problem.dt_s
     gate_front, gate_rear = axles_gated(power_demand_w, slip_front, slip_rear, problem)
     power_front, power_rear = gated_split(power_demand_w, front_share, gate_front, gate_rear)
     front_speed = wheel_speed_of_state(slip_front, speed_mps, vehicle.front)
@@ -222,23 +260,22 @@ def _dynamic_step(
 
     drag_front = idle_drag_nm(front_motor, front_speed, vehicle.front.motor)
     drag_rear = idle_drag_nm(rear_motor, rear_speed, vehicle.rear.motor)
-    resisting_front = drag_front - front_friction
-    resisting_rear = drag_rear - rear_friction
-    motion = step(
-        speed_mps,
-        (front_speed, front_speed, rear_speed, rear_speed),
-        0.0,
-        (front_motor, front_motor, rear_motor, rear_motor),
-        (resisting_front, resisting_front, resisting_rear, resisting_rear),
-        0.0,
-        (problem.friction, problem.friction, problem.friction, problem.friction),
-        dt,
-        vehicle,
-    )
+    torques = Torques(front_motor, rear_motor, drag_front - front_friction, drag_rear - rear_friction)
+    return Given(Speeds(speed_mps, front_speed, rear_speed), torques, drag_front, drag_rear, shortfall)
+
+
+@kernel
+def outcome_of(
+    power_demand_w: float, start: Given, moved: Moved, vehicle: VehicleParams, problem: ProblemParams
+) -> Step:
+    """Cost and next state of a dynamic step from what it started with and how car and wheels moved."""
+    dt = problem.dt_s
+    before, after = start.before, moved.speeds
+    front_motor, rear_motor = start.torques.front_motor_nm, start.torques.rear_motor_nm
     # Constant torques and forces over the step: their work is exact with the mean of the speeds before and after it.
-    front_mean = 0.5 * (front_speed + motion.wheel_speed_radps[0])
-    rear_mean = 0.5 * (rear_speed + motion.wheel_speed_radps[2])
-    speed_mean = 0.5 * (speed_mps + motion.speed_mps)
+    front_mean = 0.5 * (before.front_radps + after.front_radps)
+    rear_mean = 0.5 * (before.rear_radps + after.rear_radps)
+    speed_mean = 0.5 * (before.car_mps + after.car_mps)
     electrical = wheels_power_w(
         (front_motor, front_motor, rear_motor, rear_motor),
         (front_mean, front_mean, rear_mean, rear_mean),
@@ -246,23 +283,22 @@ def _dynamic_step(
         vehicle,
     )
     if problem.power_error == POWER_ERROR_WHEEL:
-        front_brake = max(motion.resisting_torque_nm[0] - drag_front, 0.0)
-        rear_brake = max(motion.resisting_torque_nm[2] - drag_rear, 0.0)
+        front_brake = max(moved.front_resisting_nm - start.front_drag_nm, 0.0)
+        rear_brake = max(moved.rear_resisting_nm - start.rear_drag_nm, 0.0)
         delivered = 2.0 * ((front_motor - front_brake) * front_mean + (rear_motor - rear_brake) * rear_mean)
     else:
         # Work of the tyres on the car, plus what the inertia of rolling wheels takes: without slip, this is exactly
         # the power at the wheels.
-        inertia_force = (equivalent_mass_kg(vehicle) - vehicle.chassis.mass_kg) * (motion.speed_mps - speed_mps) / dt
-        delivered = (2.0 * (motion.tyre_force_n[0] + motion.tyre_force_n[2]) + inertia_force) * speed_mean
+        turning_kg = equivalent_mass_kg(vehicle) - vehicle.chassis.mass_kg
+        inertia_force = turning_kg * (after.car_mps - before.car_mps) / dt
+        delivered = (2.0 * (moved.front_force_n + moved.rear_force_n) + inertia_force) * speed_mean
     front, rear = vehicle.front, vehicle.rear
     return Step(
-        chemical_power_w(electrical, battery) * dt + error_cost_j(power_demand_w, delivered, problem),
-        motion.speed_mps,
-        slip_ratio(
-            motion.wheel_speed_radps[0], motion.speed_mps, front.wheel.radius_m, front.tyre.slip_speed_floor_mps
-        ),
-        slip_ratio(motion.wheel_speed_radps[2], motion.speed_mps, rear.wheel.radius_m, rear.tyre.slip_speed_floor_mps),
-        shortfall,
+        chemical_power_w(electrical, vehicle.battery) * dt + error_cost_j(power_demand_w, delivered, problem),
+        after.car_mps,
+        slip_ratio(after.front_radps, after.car_mps, front.wheel.radius_m, front.tyre.slip_speed_floor_mps),
+        slip_ratio(after.rear_radps, after.car_mps, rear.wheel.radius_m, rear.tyre.slip_speed_floor_mps),
+        start.shortfall_w,
     )
 
 

@@ -226,7 +226,7 @@ def test_the_tables_hold_one_entry_for_every_state_and_control():
             for u, outcome in enumerate(outcomes):
                 i = first * 3 + u * (last - first) + k
                 allowed = outcome.shortfall_w <= least + 1e-6
-                assert model.free_cost[i] == (outcome.cost_j if allowed else np.inf)
+                assert model.free_cost[i] == pytest.approx(outcome.cost_j if allowed else np.inf, rel=1e-6, abs=1e-6)
                 a, b, c = np.unravel_index(model.free_corner[i], (3, n_f, n_r))
                 place = [
                     axis[j] + t * (axis[j + 1] - axis[j])
@@ -242,7 +242,7 @@ def test_the_tables_hold_one_entry_for_every_state_and_control():
                     np.clip(outcome.slip_front, -0.35, 0.1),
                     np.clip(outcome.slip_rear, -0.35, 0.0),
                 ]
-                assert place == pytest.approx(clipped, abs=1e-12)
+                assert place == pytest.approx(clipped, abs=1e-7)
 
 
 def test_gated_states_hold_the_one_step_that_table_2_leaves():
@@ -255,7 +255,7 @@ def test_gated_states_hold_the_one_step_that_table_2_leaves():
         v, f, r = np.unravel_index(model.gated_cell[i], model.cell_shape)
         state = (problem.speed_mps[v], problem.slip_front[f], problem.slip_rear[r])
         outcome = step_cost_and_next(problem.power_w[p], *state, 0.9, CAR.params, problem.params(0.5))
-        assert model.gated_cost[i] == outcome.cost_j
+        assert model.gated_cost[i] == pytest.approx(outcome.cost_j, rel=1e-6, abs=1e-6)
 
 
 def test_where_no_control_is_feasible_those_that_deliver_most_are_left():

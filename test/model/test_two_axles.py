@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The step from a guess against the step from anywhere: the same motion, or no answer of its own."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iwm_power_manager.model.longitudinal import step
+from iwm_power_manager.model.two_axles import UNSURE, Speeds, Torques, curve_of, step_from
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+
+CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), "drag").params
+FIALA = CAR.with_axles(tyre=CAR.front.tyre._replace(model=1, coefficients=(30.0, 0.7, 0.0, 0.0)))
+
+
+def _from_anywhere(before, torques, friction, dt_s, car):
+    t = torques
+    motion = step(
+        before.car_mps,
+        (before.front_radps, before.front_radps, before.rear_radps, before.rear_radps),
+        0.0,
+        (t.front_motor_nm, t.front_motor_nm, t.rear_motor_nm, t.rear_motor_nm),
+        (t.front_resisting_nm, t.front_resisting_nm, t.rear_resisting_nm, t.rear_resisting_nm),
+        0.0,
+        (friction, friction, friction, friction),
+        dt_s,
+        car,
+    )
+    return motion.speed_mps, motion.wheel_speed_radps[0], motion.wheel_speed_radps[2]
+
+
+def _curves(friction, car):
+    return curve_of(friction, car.front), curve_of(friction, car.rear)
+
+
+@settings(max_examples=400)
+@given(
+    speed=st.floats(0.0, 40.0),
+    slips=st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+    motors=st.tuples(st.floats(-80.0, 200.0), st.floats(-80.0, 200.0)),
+    brakes=st.tuples(st.floats(0.0, 600.0), st.floats(0.0, 600.0)),
+    friction=st.sampled_from([0.1, 0.2, 0.5, 0.9]),
+    dt_s=st.sampled_from([0.01, 0.1]),
+    car=st.sampled_from([CAR, FIALA]),
+)
+def test_from_any_guess_the_motion_is_that_of_the_general_step(speed, slips, motors, brakes, friction, dt_s, car):
+    before = Speeds(speed, speed * (1.0 + slips[0]) / 0.33, speed * (1.0 + slips[1]) / 0.33)
+    torques = Torques(*motors, *brakes)
+    guess = Speeds(speed + 0.05, (speed + 0.05) / 0.33, (speed + 0.05) / 0.33)
+    moved = step_from(before, torques, guess, friction, _curves(friction, car), dt_s, car)
+    assert tuple(moved.speeds) == pytest.approx(
+        _from_anywhere(before, torques, friction, dt_s, car), rel=1e-6, abs=1e-6
+    )
+    # The books: what acts on a wheel is what turns it and what the road takes (eq. 11).
+    for i, axle in enumerate((car.front, car.rear)):
+        held = (moved.front_resisting_nm, moved.rear_resisting_nm)[i]
+        force = (moved.front_force_n, moved.rear_force_n)[i]
+        turned = axle.wheel.inertia_kgm2 / dt_s * (moved.speeds[1 + i] - before[1 + i])
+        assert motors[i] - held - axle.wheel.radius_m * force == pytest.approx(turned, abs=1e-6)
+
+
+def test_without_a_curve_it_is_the_general_step_bit_by_bit():
+    before = Speeds(12.0, 36.0, 37.0)
+    torques = Torques(90.0, -20.0, 0.0, 100.0)
+    moved = step_from(before, torques, before, 0.5, UNSURE, 0.1, CAR)
+    assert tuple(moved.speeds) == _from_anywhere(before, torques, 0.5, 0.1, CAR)
+
+
+def test_a_curve_knows_its_fall_and_what_a_sliding_tyre_has_left():
+    magic, fiala = curve_of(0.9, CAR.front), curve_of(0.9, FIALA.front)
+    assert magic.fall < 0.0 < magic.sliding < 0.9
+    # Fiala's falls towards its sliding factor, and at full slip is not there yet.
+    assert fiala.sliding == pytest.approx(0.9 * (0.7 + 0.3 * math.exp(1.0 - 30.0 / 2.7)), rel=1e-9)
+    rising = CAR.front.tyre._replace(coefficients=(1.0, 1.0, 1.0, 0.0))
+    assert curve_of(0.9, CAR.front._replace(tyre=rising)).fall == 0.0
