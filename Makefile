@@ -42,6 +42,11 @@ docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study an
 bench: setup-dev  ## Time control path, bags and closed loop on this machine, each beside a peer
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit $$?; done
 
+##@ Documentation
+.PHONY: docs
+docs: setup-dev  ## The pages, every --help and the API as a site: build/docs/html/index.html (2 min)
+	@$(BIN)/python scripts/docs_site $(ARGS)
+
 ##@ Safety
 .PHONY: faults soak nightly coverage mutation
 faults: setup-run  ## Fault campaign over DDS with the simulator in the loop

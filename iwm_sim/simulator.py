@@ -434,6 +434,14 @@ class Simulator(Node):
         self.done.set_exception(error)
 
 
+_EXAMPLES = """\
+  UDDS on a wet road, in real time:
+    simulator --ros-args -p cycle_file:=udds -p friction:=0.5
+  As fast as it goes; the power manager has to be in lock-step, too:
+    simulator --ros-args -p cycle_file:=my_commute.csv -p vehicle_file:=my_car.yaml -p lockstep:=true
+"""
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Drive the cycle; returns the exit code: 0 at its end or on Ctrl-C, 1 with one line on an error."""
     interruption = Interruption()
@@ -442,7 +450,13 @@ def main(args: Sequence[str] | None = None) -> int:
     code = 1
     try:
         check_parameter_files(sys.argv if args is None else list(args))
-        check_arguments("simulator", "A driver and a car on a drive cycle, seen through topics.", PARAMETERS, args)
+        check_arguments(
+            "simulator",
+            "A driver and a car on a drive cycle, seen through topics; ends with the cycle.",
+            PARAMETERS,
+            args,
+            examples=_EXAMPLES,
+        )
         # rclpy's own handlers would close DDS under a callback that is publishing.
         rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
         node = Simulator()

@@ -663,6 +663,16 @@ class PowerManager(KeepsItsValues, LifecycleNode):
         return statuses
 
 
+_EXAMPLES = """\
+  The car of the paper, its inputs on the package's own topics:
+    power_manager
+  Your car, its policies and its topics:
+    power_manager --ros-args -p vehicle_file:=my_car.yaml -p policy_file:=my_policies -p signals_file:=my_signals.yaml
+  Everything from one file, in a namespace:
+    power_manager --ros-args --params-file config/nodes/power_manager.yaml -r __ns:=/car_1
+"""
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; exit code 1 and one line if it cannot start."""
     # rclpy's own handlers would shut the context down before zero torque could be commanded.
@@ -672,7 +682,13 @@ def main(args: list[str] | None = None) -> int:
     code = 1
     try:
         check_parameter_files(sys.argv if args is None else args)
-        check_arguments("power_manager", "Splits the driver's power demand between four motors.", config.SPECS, args)
+        check_arguments(
+            "power_manager",
+            "Splits the driver's power demand between four motors, until Ctrl-C.",
+            config.SPECS,
+            args,
+            examples=_EXAMPLES,
+        )
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PowerManager()
         interruption.started = True

@@ -38,6 +38,7 @@ from iwm_power_manager.bags.writer import Sample, WriterOptions
 from iwm_power_manager.errors import BagError, IwmError, one_line
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.ros import ending
+from iwm_power_manager.ros.arguments import EXIT_CODES, parameters_help
 from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.messages import (
     CLOCK,
@@ -380,15 +381,26 @@ def main(args: Sequence[str] | None = None) -> int:
         return 1
 
 
+_EXAMPLES = f"""\
+examples:
+  The power manager's topics, into the folder drive_01:
+    recorder --ros-args -p output:=drive_01
+  Two more of the car's own topics, in a new file every ten minutes:
+    recorder --ros-args -p output:=drive_01 -p regex:='/imu|/gps/.*' -p max_duration_s:=600.0
+  What a power cut left:
+    recorder --recover drive_01
+
+{EXIT_CODES}
+"""
+
+
 def _parser() -> argparse.ArgumentParser:
-    width = max(len(spec.name) for spec in PARAMETERS)
-    parameters = "\n".join(f"  {spec.name:{width}}  {spec.description}" for spec in PARAMETERS)
     parser = argparse.ArgumentParser(
         prog="recorder",
         usage="recorder [--ros-args -p NAME:=VALUE ... | --params-file FILE | -r FROM:=TO]\n"
         "       recorder --recover BAG ...",
         description="Record topics to a rosbag2 MCAP bag until Ctrl-C, or make a valid bag of what a crash left.",
-        epilog=f"parameters:\n{parameters}",
+        epilog=f"{parameters_help(PARAMETERS)}\n\n{_EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(

@@ -13,6 +13,8 @@ from rclpy.utilities import remove_ros_args
 from iwm_power_manager.files import read_yaml
 from iwm_power_manager.ros.parameters import ParameterError, Spec
 
+EXIT_CODES = "exit codes: 0 ended as asked, 1 could not start or failed, 2 bad arguments"
+
 _PARAMS_FILE = "--params-file"
 
 
@@ -33,7 +35,15 @@ def check_parameter_files(arguments: Sequence[str]) -> None:
             read_yaml(path)
 
 
-def check_arguments(node: str, description: str, specs: Iterable[Spec], args: Sequence[str] | None) -> None:
+def parameters_help(specs: Iterable[Spec]) -> str:
+    """Every parameter of a node with its default and what is allowed, as the end of its help."""
+    lines = [f"  {spec.name} = {_shown(spec.default)}   [{spec.allowed()}]\n      {spec.description}" for spec in specs]
+    return "parameters, their defaults and what is allowed:\n" + "\n".join(lines)
+
+
+def check_arguments(
+    node: str, description: str, specs: Iterable[Spec], args: Sequence[str] | None, *, examples: str
+) -> None:
     """Show help if it is asked for; refuse what is neither ROS's nor help. Both end the program.
 
     Parameters
@@ -42,6 +52,7 @@ def check_arguments(node: str, description: str, specs: Iterable[Spec], args: Se
     description : what it does, in one sentence
     specs : its parameters
     args : the whole command line with the program's name first; None takes the process's own
+    examples : how it is called, indented lines
 
     Raises
     ------
@@ -53,12 +64,11 @@ def check_arguments(node: str, description: str, specs: Iterable[Spec], args: Se
     except RuntimeError as error:
         # rcl adds where in its sources that was noticed.
         raise ParameterError(" ".join(str(error).split(", at ")[0].split())) from None
-    lines = [f"  {spec.name} = {_shown(spec.default)}   [{spec.allowed()}]\n      {spec.description}" for spec in specs]
     parser = argparse.ArgumentParser(
         prog=node,
         usage=f"{node} [-h] [--ros-args --params-file FILE -p PARAMETER:=VALUE -r FROM:=TO ...]",
         description=description,
-        epilog="parameters, their defaults and what is allowed:\n" + "\n".join(lines),
+        epilog=f"{parameters_help(specs)}\n\nexamples:\n{examples}\n{EXIT_CODES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.parse_args(own)

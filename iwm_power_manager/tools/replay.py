@@ -48,6 +48,8 @@ examples:
     replay drive_01 --what-if jalalmaab_2015 --strategy equal sdp
   Drive the real node with it, at half speed:
     replay drive_01 --publish --rate 0.5
+
+exit codes: 0 done, 1 recomputed and recorded differ (--compare), 2 bad arguments or files, 130 interrupted
 """
 
 

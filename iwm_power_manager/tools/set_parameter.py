@@ -77,19 +77,33 @@ class _Remote:
             raise IwmError(f"{self._name}: {transition} was refused; its log says why")
 
 
+_EXAMPLES = """\
+examples:
+  All parameters, one of them, and another value for it:
+    set_parameter
+    set_parameter friction
+    set_parameter friction=0.5
+  A node in a namespace shall command nothing any more:
+    set_parameter --node /car_1/power_manager --transition deactivate
+
+exit codes: 0 done, 1 no such node or parameter, or refused, 2 bad arguments
+"""
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="set_parameter",
         description="List, read and set a running node's parameters, or ask for a lifecycle transition, without ros2.",
-        epilog="examples: set_parameter            set_parameter friction            set_parameter friction=0.5\n"
-        "          set_parameter --node /car_1/power_manager --transition deactivate",
+        epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("parameters", metavar="NAME[=VALUE]", nargs="*", help="read these, or set them; none: all")
     parser.add_argument("--node", default="/power_manager", help="full name of the node (default /power_manager)")
     parser.add_argument("--transition", choices=_TRANSITIONS, help="ask for this transition afterwards")
-    parser.add_argument("--patience", type=float, default=10.0, metavar="S", help="wait so long for each answer")
+    parser.add_argument(
+        "--patience", type=float, default=10.0, metavar="S", help="wait so long for each answer, s (default: 10)"
+    )
     options = parser.parse_args(args)
     import rclpy
 

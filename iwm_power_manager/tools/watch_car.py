@@ -229,12 +229,26 @@ def print_reports(feed: Feed) -> None:
         print(report(feed), flush=True)
 
 
+_EXAMPLES = """\
+examples:
+  The car on this machine's domain, in the browser:
+    watch_car
+  Over ssh, without a browser:
+    watch_car --terminal
+  A power manager in a namespace, or under another name; ROS arguments stand last:
+    watch_car --ros-args -r __ns:=/car_1 -r power_manager/state:=my_node/state
+
+exit codes: 0 ended with Ctrl-C, 1 could not serve, 2 bad arguments
+"""
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the page; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="watch_car",
         description="Show a running car in the browser, from the power manager's topics alone; Ctrl-C ends it.",
-        epilog="ROS arguments may follow: --ros-args -r __ns:=/car_1 -r power_manager/state:=my_node/state",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--port", type=int, default=8321, help="port on this machine (default 8321; 0: any)")
     parser.add_argument("--terminal", action="store_true", help="no page: print state and diagnostics once a second")

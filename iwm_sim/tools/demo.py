@@ -45,35 +45,70 @@ _ONE_PROCESS = "in one process"
 # --- command line ---------------------------------------------------------------------------------------------------
 
 
+_EXAMPLES = """\
+examples:
+  The New York City Cycle as fast as it goes (a minute), recorded; the page is runs/nycc/drive.html:
+    demo --output runs/nycc
+  Your car, policies and commute; its first half minute only:
+    demo --vehicle my_car.yaml --policy my_policies --cycle my_commute.csv --until 30
+  A full brake with one side on ice:
+    demo --scenario split_stop
+
+exit codes: 0 driven, 1 failed, 2 bad arguments or files, 130 interrupted
+"""
+
+
 def parse(arguments: Sequence[str] | None = None) -> Plan:
     """The plan of a command line; ends the program on a wrong one."""
     parser = argparse.ArgumentParser(
         prog="demo",
         description="Drive a cycle over DDS with recorder, power manager and simulator, and show the result.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_EXAMPLES,
     )
-    parser.add_argument("--cycle", default="config/cycles/nycc.csv", help="drive cycle, CSV")
+    shown = "(default: %(default)s)"
+    parser.add_argument(
+        "--cycle", metavar="CSV", default="config/cycles/nycc.csv", help=f"drive cycle: time_s,speed_mps {shown}"
+    )
     parser.add_argument(
         "--scenario", default="", metavar="YAML", help="scenario instead of cycle, vehicle, friction and charge"
     )
-    parser.add_argument("--vehicle", default="config/vehicles/jalalmaab_2015.yaml", help="vehicle, YAML")
-    parser.add_argument("--policy", default="policies", help="policy file, or folder with a bank of them")
     parser.add_argument(
-        "--strategy", default=DEFAULT_STRATEGY, choices=drivable(), help="how the power manager splits the demand"
+        "--vehicle", metavar="YAML", default="config/vehicles/jalalmaab_2015.yaml", help=f"the car {shown}"
     )
-    parser.add_argument("--friction", default=0.9, type=number(0.05, 1.5), help="peak friction coefficient")
     parser.add_argument(
-        "--idle-drive", default="", choices=["", *IDLE_DRIVES], help="replaces the vehicle's idle_drive; '': as it is"
+        "--policy", metavar="DIR|FILE", default="policies", help=f"policy file, or folder with a bank of them {shown}"
     )
-    parser.add_argument("--rate", default=50.0, type=number(10.0, 1000.0), help="control rate, Hz")
-    parser.add_argument("--soc", default=0.8, type=number(0.0, 1.0), help="state of charge at the start, 0..1")
-    parser.add_argument("--until", default=0.0, type=number(0.0, 1e6), help="drive only so much of it, s; 0: all")
+    parser.add_argument(
+        "--strategy",
+        metavar="NAME",
+        default=DEFAULT_STRATEGY,
+        choices=drivable(),
+        help=f"how the power manager splits the demand: {', '.join(drivable())} {shown}",
+    )
+    parser.add_argument(
+        "--friction", metavar="MU", default=0.9, type=number(0.05, 1.5), help=f"peak friction coefficient {shown}"
+    )
+    parser.add_argument(
+        "--idle-drive",
+        metavar="NAME",
+        default="",
+        choices=["", *IDLE_DRIVES],
+        help=f"what a motor at zero torque costs: {', '.join(IDLE_DRIVES)} (default: as the car's file says)",
+    )
+    parser.add_argument("--rate", metavar="HZ", default=50.0, type=number(10.0, 1000.0), help=f"control rate {shown}")
+    parser.add_argument(
+        "--soc", metavar="SOC", default=0.8, type=number(0.0, 1.0), help=f"state of charge at the start, 0..1 {shown}"
+    )
+    parser.add_argument(
+        "--until", metavar="S", default=0.0, type=number(0.0, 1e6), help="drive only its first S seconds (default: all)"
+    )
     parser.add_argument("--realtime", action="store_true", help="in real time instead of lock-step")
     parser.add_argument("--no-record", action="store_true", help="without the recorder")
     parser.add_argument(
-        "--output", type=Path, help="folder for everything that is made (default: runs/<date and time>)"
+        "--output", metavar="DIR", type=Path, help="folder for everything that is made (default: runs/<date and time>)"
     )
-    parser.add_argument("--json", type=Path, help="also write the result's rows here")
+    parser.add_argument("--json", metavar="FILE", type=Path, help="also write the result's rows here")
     given = parser.parse_args(arguments)
     return Plan(
         cycle=given.cycle,

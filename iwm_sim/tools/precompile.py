@@ -110,6 +110,7 @@ def parser() -> argparse.ArgumentParser:
         description="Compile the vehicle model, the control law and the solver once, so that every program starts "
         "warm. The code is kept in ~/.cache/iwm_power_manager or, if it is set, in IWM_CACHE_DIR, which then has to "
         "be the same where the programs run. Needed again after an update; what is compiled already is only looked up.",
+        epilog="exit codes: 0 done, 1 a shipped file is unusable, 2 bad arguments",
     )
     made.add_argument("--json", action="store_true", help="list every entry point with its seconds, as JSON")
     made.add_argument("--quiet", action="store_true", help="no progress bar")
