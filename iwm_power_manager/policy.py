@@ -217,7 +217,7 @@ def make_policy(
 
 def _with_checksum(policy: Policy) -> Policy:
     arrays, metadata = _content(policy)
-    return dataclasses.replace(policy, checksum=_checksum(arrays, metadata))
+    return dataclasses.replace(policy, checksum=checksum_of(arrays, metadata))
 
 
 def _content(policy: Policy) -> tuple[dict[str, NDArray[np.float64]], bytes]:
@@ -249,7 +249,8 @@ def _content(policy: Policy) -> tuple[dict[str, NDArray[np.float64]], bytes]:
     return arrays, json.dumps(metadata, indent=1, sort_keys=True, allow_nan=False).encode()
 
 
-def _checksum(arrays: Mapping[str, NDArray[np.float64]], metadata: bytes) -> str:
+def checksum_of(arrays: Mapping[str, NDArray[np.float64]], metadata: bytes) -> str:
+    """What a policy file has to state of its content: SHA-256 of its metadata and of its arrays' names and numbers."""
     digest = hashlib.sha256(metadata)
     for name in _ARRAYS:
         array = np.ascontiguousarray(arrays[name], dtype="<f8")
@@ -263,7 +264,7 @@ def policy_bytes(policy: Policy) -> bytes:
     arrays, metadata = _content(policy)
     members = {name: np.ascontiguousarray(array, dtype="<f8") for name, array in arrays.items()}
     members["metadata"] = np.frombuffer(metadata, dtype=np.uint8)
-    members["checksum"] = np.frombuffer(_checksum(arrays, metadata).encode(), dtype=np.uint8)
+    members["checksum"] = np.frombuffer(checksum_of(arrays, metadata).encode(), dtype=np.uint8)
     output = io.BytesIO()
     with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for name in _MEMBERS:
@@ -314,7 +315,7 @@ def load_policy(path: Path | str) -> Policy:
         if members[name].dtype != np.dtype("<f8"):
             raise PolicyError(f"{path}: is damaged: {name} holds {members[name].dtype}, not float64")
     arrays = {name: np.ascontiguousarray(members[name], dtype=np.float64) for name in _ARRAYS}
-    checksum = _checksum(arrays, raw)
+    checksum = checksum_of(arrays, raw)
     if members["checksum"].tobytes() != checksum.encode():
         raise PolicyError(f"{path}: is damaged: its content does not match its checksum")
     return _policy_from(arrays, metadata, checksum, path)

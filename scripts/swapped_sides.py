@@ -20,6 +20,8 @@ _ACROSS = {"left": "right", "right": "left", "fl": "fr", "fr": "fl", "rl": "rr",
 _ALONG = {"front": "rear", "rear": "front", "fl": "rl", "rl": "fl", "fr": "rr", "rr": "fr"}
 _PART = re.compile(r"[A-Za-z]+|[^A-Za-z]+")
 _WHEELS = 4
+#: Functions whose arguments have no order.
+_EITHER_WAY = ("min", "max", "worse_slip")
 
 
 def _other_names(name: str) -> set[str]:
@@ -111,6 +113,6 @@ def swaps_of(source: str) -> list[str]:
                 found += [text.replaced(*text.span(node.slice), str(index ^ bit)) for bit in (1, 2)]
         elif isinstance(node, ast.Tuple):
             found += [text.exchanged(*pair) for pair in _pairs(text, node.elts, len(node.elts) == _WHEELS)]
-        elif isinstance(node, ast.Call):
+        elif isinstance(node, ast.Call) and text.of(node.func) not in _EITHER_WAY:
             found += [text.exchanged(*pair) for pair in _pairs(text, node.args, False)]
     return found

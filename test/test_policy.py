@@ -233,7 +233,7 @@ def _rebuilt(content, change=lambda metadata: None, arrays=None, drop=(), sign=T
     raw = json.dumps(metadata).encode()
     members["metadata"] = np.frombuffer(raw, np.uint8)
     if sign:
-        checksum = policy_module._checksum(members, raw)
+        checksum = policy_module.checksum_of(members, raw)
         members["checksum"] = np.frombuffer(checksum.encode(), np.uint8)
     output = io.BytesIO()
     np.savez(output, **{name: value for name, value in members.items() if name not in drop})

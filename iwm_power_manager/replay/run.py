@@ -31,7 +31,8 @@ STATE = "power_manager/state"
 #: What a replay computes anew.
 COMPUTED = (MOTOR_COMMAND, FRICTION_COMMAND, STATE)
 
-_PROGRESS_EVERY = 2000
+#: Messages between two calls of `progress`.
+PROGRESS_EVERY = 2000
 #: Readings from the bag's start that show whether its messages come in sets of one stamp.
 _PROBE_READINGS = 1000
 #: Below this share of the messages of the busiest topic, a replay says that it made few steps.
@@ -135,7 +136,7 @@ class Replay:
         """
         for message in self._bag.messages():
             self._messages += 1
-            if progress is not None and self._messages % _PROGRESS_EVERY == 0:
+            if progress is not None and self._messages % PROGRESS_EVERY == 0:
                 progress(self._messages, message.log_time_ns)
             steps = self._take(message)
             if steps:

@@ -149,7 +149,7 @@ class Witness:
                 break
             if to_s <= from_s:
                 continue
-            total_s += _overlap_s(stalls, reached_s, from_s)
+            total_s += overlap_s(stalls, reached_s, from_s)
             reached_s = to_s
             slept = after.sleeps != before.sleeps
             if before.wants_to_run and not slept:
@@ -165,17 +165,17 @@ class Witness:
                 since_s = from_s if asleep_since_s is None else asleep_since_s
                 # A stall that was over while it still slept held nothing up. Just after one, it has yet to be woken.
                 lasting = stalls[stalls[:, 1] > from_s - _TICK_S]
-                total_s += _overlap_s(lasting, since_s, to_s)
+                total_s += overlap_s(lasting, since_s, to_s)
                 asleep_since_s = None
         total_s += self._kept_s(processor, running_since_s, reached_s, used_s)
-        return total_s + _overlap_s(stalls, reached_s, end_s)
+        return total_s + overlap_s(stalls, reached_s, end_s)
 
     def _kept_s(self, processor: int, begin_s: float, end_s: float, used_s: float) -> float:
         """What the machine kept from the process while it wanted to run; 0 if it never began (NaN)."""
         if math.isnan(begin_s):
             return 0.0
         withheld = self.withheld.get(processor, np.empty((0, 2)))
-        given_s = min(used_s, end_s - begin_s - _overlap_s(withheld, begin_s, end_s))
+        given_s = min(used_s, end_s - begin_s - overlap_s(withheld, begin_s, end_s))
         return end_s - begin_s - given_s
 
     def slowest_work_s(self, begin_s: float, end_s: float) -> tuple[float, float]:
@@ -199,7 +199,7 @@ class Witness:
         )
 
 
-def _overlap_s(spans: NDArray[np.float64], begin_s: float, end_s: float) -> float:
+def overlap_s(spans: NDArray[np.float64], begin_s: float, end_s: float) -> float:
     """Time between `begin_s` and `end_s` that lies in spans: shape (n, 2), in the order of time, none in another."""
     near = spans[np.searchsorted(spans[:, 1], begin_s) : np.searchsorted(spans[:, 0], end_s)]
     return float(np.sum(np.maximum(np.minimum(near[:, 1], end_s) - np.maximum(near[:, 0], begin_s), 0.0)))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from iwm_sim.campaigns import soak
-from iwm_sim.campaigns.witness import Look, Stall, Witness, _overlap_s
+from iwm_sim.campaigns.witness import Look, Stall, Witness, overlap_s
 
 #: Wants the processor it is given all the time.
 BUSY = "import os, sys; os.sched_setaffinity(0, {int(sys.argv[1])})\nwhile True: pass"
@@ -146,7 +146,7 @@ def test_while_the_witness_is_to_run_nothing_else_does() -> None:
     assert len(withheld) > 1000
     lasted_s = withheld[:, 1] - withheld[:, 0]
     assert np.all(lasted_s > 0.0) and np.all(withheld[1:, 0] >= withheld[:-1, 1] - 1e-4)
-    without_clock_s = sum(_overlap_s(gaps, *span) for span in withheld)
+    without_clock_s = sum(overlap_s(gaps, *span) for span in withheld)
     assert without_clock_s > 0.95 * lasted_s.sum()
 
 

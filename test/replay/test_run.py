@@ -507,13 +507,13 @@ def test_progress_is_called_with_messages_and_time(drive: Path) -> None:
         replay = Replay(bag, make_plan(Choice(strategy="equal"), bag.custom_data), load_mapping())
         from iwm_power_manager.replay import run as module
 
-        every = module._PROGRESS_EVERY
-        module._PROGRESS_EVERY = 100
+        every = module.PROGRESS_EVERY
+        module.PROGRESS_EVERY = 100
         try:
             for _ in replay.steps(lambda messages, log_time_ns: seen.append((messages, log_time_ns))):
                 pass
         finally:
-            module._PROGRESS_EVERY = every
+            module.PROGRESS_EVERY = every
     assert [messages for messages, _ in seen] == list(range(100, COUNT * 7 + 1, 100))
     assert [time for _, time in seen] == sorted(time for _, time in seen)
 

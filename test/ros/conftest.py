@@ -28,7 +28,7 @@ EQUAL = {"strategy": "equal", "policy_file": ""}
 class Pair:
     """A power manager and a bench in one namespace."""
 
-    _count = 0
+    count = 0
 
     def __init__(
         self,
@@ -38,9 +38,9 @@ class Pair:
         sim_time: bool = False,
         environment: dict[str, str] | None = None,
     ) -> None:
-        Pair._count += 1
+        Pair.count += 1
         domain = int(os.environ["ROS_DOMAIN_ID"])
-        namespace = f"/test_{os.getpid()}_{Pair._count}"
+        namespace = f"/test_{os.getpid()}_{Pair.count}"
         self.bench = Bench(domain, lockstep=bool(parameters.get("lockstep")), namespace=namespace, sim_time=sim_time)
         remaps = {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics", "/clock": f"{namespace}/clock"}
         given = {name.replace("{namespace}", namespace): value for name, value in parameters.items()}
