@@ -131,13 +131,13 @@ def decompress_file(path: Path, target: Path) -> str:
     Raises
     ------
     BagError
-        It holds more than its size, or the disk, allows.
+        It holds more than its size, or the disk, allows, or nothing.
     """
     import zstandard
 
     size = regular_file(path)
     most = min(FREE_BYTES + MAX_RATIO * size, shutil.disk_usage(target.parent).free // 2)
-    written = 0
+    written, problem = 0, ""
     try:
         with (
             path.open("rb") as source,
@@ -150,7 +150,9 @@ def decompress_file(path: Path, target: Path) -> str:
                     raise BagError(f"{path}: holds more than {most} bytes, from {size}")
                 sink.write(piece)
     except zstandard.ZstdError as error:
-        return f"is damaged: {error}"
+        problem = f"is damaged: {error}"
     except OSError as error:
         raise BagError(f"{path}: cannot be decompressed: {error.strerror or error}") from None
-    return "" if written else "holds nothing"
+    if not written:
+        raise BagError(f"{path}: {problem or 'is empty'}")
+    return problem

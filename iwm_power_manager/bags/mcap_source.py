@@ -148,16 +148,16 @@ class McapSource:
             elif record.opcode == Opcode.HEADER:
                 self.header = read_record(Header, self.data, record)
             elif record.opcode == UNREADABLE and record.end < len(self.data):
-                self._note(f"holds no record from byte {record.start} to {record.end}")
+                self.note(f"holds no record from byte {record.start} to {record.end}")
                 statistics = None
             else:
                 self._take_definition(record)
         if record is None or record.opcode != Opcode.FOOTER or self.data[record.end :] != MAGIC:
-            self._note("ends without a footer: the recorder did not finish it")
+            self.note("ends without a footer: the recorder did not finish it")
             return None
         start, _, crc = struct.unpack_from("<QQI", self.data, record.body)
         if crc and (not start or zlib.crc32(self.data[start : record.end - 4]) != crc):
-            self._note("its summary is damaged")
+            self.note("its summary is damaged")
             return None
         return None if self.damage else statistics
 
@@ -173,7 +173,7 @@ class McapSource:
         try:
             self.definitions.take(self.data, record)
         except BagError as error:
-            self._note(f"{error} at byte {record.start}")
+            self.note(f"{error} at byte {record.start}")
 
     def _open_all(self) -> None:
         """Look into every chunk: channels may be announced there and nowhere else, and its head may be wrong."""
@@ -188,7 +188,8 @@ class McapSource:
                 end_ns = max(end_ns, *times)
         self.start_ns, self.end_ns = min((piece.start_ns for piece in self._pieces), default=0), end_ns
 
-    def _note(self, line: str) -> None:
+    def note(self, line: str) -> None:
+        """Add a line to the damage."""
         if line not in self.damage:
             self.damage.append(line)
 
@@ -210,7 +211,7 @@ class McapSource:
                 size += len(message[2]) + MESSAGE_OVERHEAD_BYTES
                 heapq.heappush(waiting, (message[0], next(order), message))
             if size > MAX_OVERLAP_BYTES:
-                self._note("its chunks overlap in time by more than fits into memory: not all is in order")
+                self.note("its chunks overlap in time by more than fits into memory: not all is in order")
                 next_ns = _NEVER
             while waiting and waiting[0][0] <= next_ns:
                 message = heapq.heappop(waiting)[2]
@@ -226,7 +227,7 @@ class McapSource:
                 self.definitions,
             )
         except BagError as error:
-            self._note(f"the chunk at byte {record.start} {error}")
+            self.note(f"the chunk at byte {record.start} {error}")
             return []
 
     def raw(self, record: Record) -> bytes:

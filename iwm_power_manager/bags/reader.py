@@ -18,6 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
 from iwm_power_manager.bags.limits import MAX_METADATA_BYTES, ZSTD_MAGIC, decompress, decompress_file, regular_file
+from iwm_power_manager.bags.mcap_records import MAGIC
 from iwm_power_manager.bags.mcap_source import McapSource
 from iwm_power_manager.bags.metadata import METADATA_FILE, Topic, information_of, problem_with, text_values
 from iwm_power_manager.bags.sqlite_source import SqliteSource
@@ -27,6 +28,7 @@ Source = McapSource | SqliteSource
 
 SUFFIXES = (".mcap", ".db3")
 COMPRESSED_SUFFIX = ".zstd"
+_SQLITE_MAGIC = b"SQLite format 3\0"
 
 
 class Message(NamedTuple):
@@ -85,10 +87,7 @@ class BagReader:
         self.counts: Counter[str] = Counter()
         self.custom_data = text_values(self.information.get("custom_data"))
         for source in self.sources:
-            self._take_topics(source)
-            for number, topic in source.topics().items():
-                self.counts[topic.name] += source.counts[number]
-            self.custom_data = source.custom_data() | self.custom_data
+            self._take(source)
         filled = [source for source in self.sources if source.counts.total()]
         self.start_ns = min((source.start_ns for source in filled), default=0)
         self.end_ns = max((source.end_ns for source in filled), default=0)
@@ -139,30 +138,31 @@ class BagReader:
                     unpackable += 1  # stays as it is; decoders refuse and count it
             yield Message(log_time, name, data, publish_time, sequence)
         if homeless:
-            source.damage.append(f"{homeless} message(s) belong to channels that are nowhere announced")
+            source.note(f"{homeless} message(s) belong to channels that are nowhere announced")
         if unpackable:
-            source.damage.append(f"{unpackable} compressed message(s) cannot be decompressed")
+            source.note(f"{unpackable} compressed message(s) cannot be decompressed")
 
     # --- opening ----------------------------------------------------------------------------------------------------
 
-    def _take_topics(self, source: Source) -> None:
-        for topic in source.topics().values():
+    def _take(self, source: Source) -> None:
+        """What a file knows of topics, counts and custom data."""
+        for number, topic in source.topics().items():
+            self.counts[topic.name] += source.counts[number]
             known = self.topics.setdefault(topic.name, topic)
             if (known.type, known.definition) != (topic.type, topic.definition) and topic.definition:
-                line = f"{source.path}: {topic.name} has more than one definition; it is read by the first"
-                if line not in self._damage:
-                    self._damage.append(line)
+                source.note(f"{topic.name} has more than one definition; it is read by the first")
+        self.custom_data = source.custom_data() | self.custom_data
 
     def _information(self) -> dict[str, Any]:
+        path = self.path / METADATA_FILE
         if not self.path.is_dir():
             return {}
-        path = self.path / METADATA_FILE
         if not path.exists():
             self._damage.append(f"{self.path}: has no metadata.yaml: the recorder did not finish")
             return {}
         try:
             if regular_file(path, self.path) <= MAX_METADATA_BYTES:
-                found = information_of(path.read_text(encoding="utf-8"))
+                found = information_of(path.read_text(encoding="utf-8-sig"))
                 problem = problem_with(found)
                 if problem:
                     self._damage.append(f"{path}: {problem} is missing or of the wrong kind; the data files are read")
@@ -173,11 +173,12 @@ class BagReader:
         return {}
 
     def _open_all(self) -> None:
-        names = self._file_names()
         problems = []
-        for name in names:
+        for name in self._file_names():
             try:
-                self.sources.append(self._open(name))
+                opened, problem = opened_file(name, self._stack, self.path if self.path != name else None)
+                self._damage += [f"{name}: {problem}"] if problem else []
+                self.sources.append(open_source(opened, name, self._stack))
             except BagError as error:
                 problems.append(str(error))
         if not self.sources:
@@ -195,24 +196,35 @@ class BagReader:
         self._damage += [f"{name}: is missing" for name in names if name not in present]
         return present or data_files(self.path)
 
-    def _open(self, path: Path) -> Source:
-        folder = self.path if self.path != path else None
-        regular_file(path, folder)
-        opened = path
-        if path.suffix == COMPRESSED_SUFFIX:
-            opened = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_bag_"))) / path.stem
-            problem = decompress_file(path, opened)
-            if problem:
-                self._damage.append(f"{path}: {problem}")
-        try:
-            return open_source(opened, self._stack)
-        except BagError as error:  # not under the name of a copy
-            raise BagError(str(error).replace(str(opened), str(path))) from None
+
+def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside: bool = False) -> tuple[Path, str]:
+    """A data file itself, or a copy that is decompressed (and goes with `stack`), and what is wrong with it.
+
+    Raises
+    ------
+    BagError
+        It is no regular file, lies outside of its `folder`, or cannot be decompressed.
+    """
+    regular_file(path, folder)
+    if path.suffix != COMPRESSED_SUFFIX:
+        return path, ""
+    where = path.parent if beside else None
+    copied = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_bag_", dir=where))) / path.stem
+    return copied, decompress_file(path, copied)
 
 
-def open_source(path: Path, stack: ExitStack, suffix: str = "") -> Source:
-    """Open a data file by its suffix, or by another one."""
-    return (SqliteSource if (suffix or path.suffix) == ".db3" else McapSource)(path, stack)
+def open_source(opened: Path, path: Path, stack: ExitStack) -> Source:
+    """Open a data file, or a copy of the one at `path`, as what it is by its first bytes, else by its name."""
+    try:
+        with opened.open("rb") as file:
+            head = file.read(len(_SQLITE_MAGIC))
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read: {error.strerror or error}") from None
+    sqlite = head == _SQLITE_MAGIC or (opened.suffix == ".db3" and not head.startswith(MAGIC))
+    try:
+        return SqliteSource(opened, stack) if sqlite else McapSource(opened, stack)
+    except BagError as error:  # not under the name of a copy
+        raise BagError(str(error).replace(str(opened), str(path))) from None
 
 
 def data_files(folder: Path) -> list[Path]:

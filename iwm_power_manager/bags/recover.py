@@ -16,14 +16,14 @@ import sqlite3
 import tempfile
 from collections import Counter
 from collections.abc import Iterable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
 
-from iwm_power_manager.bags.limits import ZSTD_MAGIC, decompress_file, regular_file
+from iwm_power_manager.bags.limits import ZSTD_MAGIC, regular_file
 from iwm_power_manager.bags.mcap_file import McapFile
 from iwm_power_manager.bags.mcap_records import (
     FIRST_PRIVATE,
@@ -37,7 +37,16 @@ from iwm_power_manager.bags.mcap_records import (
 )
 from iwm_power_manager.bags.mcap_source import McapSource
 from iwm_power_manager.bags.metadata import FileSpan, Topic, text_values
-from iwm_power_manager.bags.reader import COMPRESSED_SUFFIX, SUFFIXES, BagReader, Source, data_files, open_source
+from iwm_power_manager.bags.reader import (
+    COMPRESSED_SUFFIX,
+    SUFFIXES,
+    BagReader,
+    Source,
+    data_files,
+    open_source,
+    opened_file,
+)
+from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.files import sync_folder
@@ -234,14 +243,11 @@ class _File:
     def __init__(self, path: Path, stack: ExitStack) -> None:
         self._stack = stack
         self.path = path
-        self.is_sqlite = path.name.removesuffix(COMPRESSED_SUFFIX).endswith(".db3")
         self.is_compressed = path.suffix == COMPRESSED_SUFFIX
         self._temporary: Path | None = None
         opened, problem = _opened(path, stack)
-        try:
-            self.seen = _Seen(open_source(opened, stack))
-        except BagError as error:  # not under the name of a copy
-            raise BagError(str(error).replace(str(opened), str(path))) from None
+        self.seen = _Seen(open_source(opened, path, stack))
+        self.is_sqlite = isinstance(self.seen.source, SqliteSource)
         self.problem = problem or "; ".join(self.seen.source.damage[:3])
         self.report = FileRecovery(path.name, False, self.seen.count, "")
 
@@ -253,7 +259,7 @@ class _File:
             temporary.unlink(missing_ok=True)
             self._stack.callback(temporary.unlink, missing_ok=True)
             copy = _Copy(self.seen.source, temporary)
-            made = _Seen(open_source(temporary, self._stack, ".mcap"))
+            made = _Seen(open_source(temporary, target, self._stack))
         except OSError as error:
             raise BagError(f"{temporary}: cannot be written: {error.strerror or error}") from None
         if made.source.damage or made.count < self.seen.count:
@@ -293,21 +299,15 @@ def is_own(source: Source) -> bool:
 def _opened(path: Path, stack: ExitStack) -> tuple[Path, str]:
     """The file itself, or a copy that can be read, and what is wrong with it."""
     journals = [journal for end in ("-wal", "-journal") if (journal := path.with_name(path.name + end)).is_file()]
-    if path.suffix != COMPRESSED_SUFFIX and not journals:
-        return path, ""
+    if not journals:
+        return opened_file(path, stack, beside=True)
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_recover_", dir=path.parent)))
-    copied = folder / path.name.removesuffix(COMPRESSED_SUFFIX)
-    if path.suffix == COMPRESSED_SUFFIX:
-        return copied, decompress_file(path, copied)
     for file in (path, *journals):
         regular_file(file)
         shutil.copyfile(file, folder / file.name)
-    try:
-        with closing(sqlite3.connect(copied)) as database:
-            database.execute("PRAGMA journal_mode = DELETE")
-    except sqlite3.Error:
-        pass  # then it is read without
-    return copied, "has a journal: the recorder did not finish"
+    with suppress(sqlite3.Error), closing(sqlite3.connect(folder / path.name)) as database:  # else it is read without
+        database.execute("PRAGMA journal_mode = DELETE")
+    return folder / path.name, "has a journal: the recorder did not finish"
 
 
 class _Copy:

@@ -86,9 +86,9 @@ class SqliteSource:
                         bad += 1
                 break
             except (sqlite3.Error, OverflowError, MemoryError) as error:
-                self._note(f"is not readable to its end: {_one_line(error)}")
+                self.note(f"is not readable to its end: {_one_line(error)}")
         if bad:
-            self._note(f"{bad} row(s) hold no message of a known topic")
+            self.note(f"{bad} row(s) hold no message of a known topic")
 
     def _out_of_steps(self) -> bool:
         self._steps -= 1
@@ -102,7 +102,7 @@ class SqliteSource:
             )
             return {str(name): (str(encoding), str(text)) for name, encoding, text in rows}
         except sqlite3.Error as error:
-            self._note(f"has no readable definitions: {_one_line(error)}")
+            self.note(f"has no readable definitions: {_one_line(error)}")
             return {}
 
     def _read_topics(self) -> None:
@@ -110,7 +110,7 @@ class SqliteSource:
             found = dict(zip(row.keys(), row, strict=True))
             msgtype, serialization = found["type"], found.get("serialization_format", "cdr")
             if not (isinstance(msgtype, str) and isinstance(serialization, str) and isinstance(found["name"], str)):
-                self._note(f"topic {found['id']} is described by something else than text")
+                self.note(f"topic {found['id']} is described by something else than text")
             encoding, text = self._definitions.get(str(msgtype), ("", ""))
             self._topics[found["id"]] = Topic(
                 str(found["name"]),
@@ -125,16 +125,18 @@ class SqliteSource:
     def _count(self) -> None:
         try:
             for number, count, start_ns, end_ns in self._database.execute(
-                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
+                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages"
+                " WHERE typeof(timestamp) = 'integer' GROUP BY topic_id"
             ):
                 self.start_ns = min(self.start_ns, start_ns) if self.counts else start_ns
                 self.end_ns = max(self.end_ns, end_ns)
                 self.counts[number] = count
-        except (sqlite3.Error, TypeError, OverflowError) as error:
-            self._note(f"is damaged: {_one_line(error)}")
+        except sqlite3.Error as error:
+            self.note(f"is damaged: {_one_line(error)}")
             self.counts.clear()
 
-    def _note(self, line: str) -> None:
+    def note(self, line: str) -> None:
+        """Add a line to the damage."""
         if line not in self.damage:
             self.damage.append(line)
 

@@ -150,7 +150,8 @@ def _parsed(name: str, encoding: str, text: str) -> dict[str, Any]:
 
     if len(text) > MAX_TEXT_BYTES:
         raise BagError(f"its definition has {len(text)} characters; allowed: <= {MAX_TEXT_BYTES}")
-    text = re.sub(r"^={40,}[ \t]*$", _SEPARATOR, text.replace("\r\n", "\n").replace("\r", "\n"), flags=re.MULTILINE)
+    text = text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n").replace("\t", " ")
+    text = re.sub(r"^={40,} *$", _SEPARATOR, text, flags=re.MULTILINE)
     if encoding == MSG:
         # The grammar knows no bounded wstring; the bound is not in the bytes.
         return dict(get_types_from_msg(re.sub(r"^(\s*wstring)<=\d+", r"\1", text, flags=re.MULTILINE), name))
