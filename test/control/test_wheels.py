@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Four wheels, each its own: what is wrong with one shows on that one, and a mirrored car gets mirrored commands."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iwm_power_manager.control import law
+from iwm_power_manager.control.settings import GATE_MODE_OFF, default_settings
+from iwm_power_manager.control.table import empty_table
+from iwm_power_manager.control.types import ControllerState, Measurement, initial_state
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+
+PAPER = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+#: Front and rear are nowhere alike.
+CAR = PAPER._replace(
+    rear=PAPER.rear._replace(
+        motor=PAPER.rear.motor._replace(max_power_w=6000.0, peak_torque_nm=150.0, regeneration_torque_nm=60.0),
+        wheel=PAPER.rear.wheel._replace(radius_m=0.3, inertia_kgm2=0.8),
+        friction_brake=PAPER.rear.friction_brake._replace(max_torque_nm=400.0),
+    )
+)
+RADII = (CAR.front.wheel.radius_m,) * 2 + (CAR.rear.wheel.radius_m,) * 2
+SPEED = 15.0
+WHEELS = pytest.mark.parametrize("wheel", range(4))
+TABLE = empty_table()
+#: Left and right may differ as much as they like, so that what limits one wheel does not show on the other.
+LIMITER = default_settings("equal")._replace(
+    front_yaw_nm=20e3, front_yaw_most_nm=20e3, rear_yaw_nm=20e3, rear_yaw_most_nm=20e3
+)
+OFF = LIMITER._replace(gate_mode=GATE_MODE_OFF)
+
+
+def one(wheel, value, others):
+    return tuple(value if i == wheel else other for i, other in enumerate(others))
+
+
+def rolling(speed=SPEED):
+    return tuple(speed / radius for radius in RADII)
+
+
+def measured(demand, wheels=None, speed=SPEED, gain=(1.0,) * 4):
+    return Measurement(
+        speed_mps=speed,
+        wheel_speed_radps=rolling(speed) if wheels is None else wheels,
+        power_demand_w=demand,
+        dt_s=0.01,
+        friction=0.9,
+        discharge_limit_w=47500.0,
+        charge_limit_w=47500.0,
+        soc=0.6,
+        motor_gain=gain,
+    )
+
+
+def remembered(speed=SPEED, **parts) -> ControllerState:
+    """The second step of a car that rolls; `parts` : four values of a field of `WheelState`."""
+    start = initial_state()
+    wheels = tuple(
+        state._replace(speed_radps=rim, **{name: values[i] for name, values in parts.items()})
+        for i, (state, rim) in enumerate(zip(start.wheels, rolling(speed), strict=True))
+    )
+    motion = start.motion._replace(speed_mps=speed, shown_mps=speed)
+    return start._replace(steps=1, wheels=wheels, motion=motion)
+
+
+def step(measurement, state=None, tuned=LIMITER):
+    return law.step(measurement, initial_state() if state is None else state, tuned, CAR, TABLE)
+
+
+@WHEELS
+@pytest.mark.parametrize(("demand", "rim"), [(-12e3, 0.6 * SPEED), (12e3, 1.6 * SPEED)])
+def test_only_the_wheel_that_skids_is_gated(wheel, demand, rim):
+    wheels = one(wheel, rim / RADII[wheel], rolling())
+    command, after = step(measured(demand, wheels), tuned=LIMITER._replace(gate_driving=True))
+    assert command.gated_wheels == 1 << wheel
+    assert [state.gated for state in after.wheels] == [i == wheel for i in range(4)]
+    assert command.motor_torque_nm[wheel] == command.friction_torque_nm[wheel] == 0.0
+    assert all(command.motor_torque_nm[i] != 0.0 for i in range(4) if i != wheel)
+
+
+@WHEELS
+def test_each_wheel_s_slip_is_its_own_and_an_axle_s_is_its_worse_wheel_s(wheel):
+    wheels = one(wheel, 0.9 * rolling()[wheel], rolling())
+    command, after = step(measured(-3e3, wheels))
+    assert [state.slip == pytest.approx(-0.1, abs=1e-3) for state in after.wheels] == [i == wheel for i in range(4)]
+    assert (command.front_slip < -0.05) == (wheel < 2)
+    assert (command.rear_slip < -0.05) == (wheel >= 2)
+
+
+@WHEELS
+def test_a_hot_motor_is_held_to_its_continuous_torque_and_the_others_are_not(wheel):
+    # Slow, so that torque and not power is the limit; and enough for all of it.
+    before = remembered(2.0, heat=one(wheel, 1.0, (0.0,) * 4), motor_nm=(100.0, 100.0, 100.0, 100.0))
+    cold, _ = step(measured(60e3, speed=2.0), remembered(2.0, motor_nm=(100.0,) * 4), OFF)
+    hot, _ = step(measured(60e3, speed=2.0), before, OFF)
+    lower = [h < c - 1.0 for h, c in zip(hot.motor_torque_nm, cold.motor_torque_nm, strict=True)]
+    assert lower[wheel]
+    assert not any(lower[2:] if wheel < 2 else lower[:2])
+
+
+@WHEELS
+def test_a_motor_that_gives_nothing_is_asked_for_nothing(wheel):
+    command, _ = step(measured(12e3, gain=one(wheel, 0.0, (1.0,) * 4)), tuned=LIMITER)
+    assert [torque == 0.0 for torque in command.motor_torque_nm] == [i == wheel for i in range(4)]
+
+
+@WHEELS
+def test_each_motor_s_way_goes_on_from_its_own_torque(wheel):
+    before = remembered(motor_nm=one(wheel, 40.0, (0.0,) * 4))
+    command, _ = step(measured(20e3), before, OFF._replace(slew_up_nmps=100.0))
+    assert command.motor_torque_nm == pytest.approx(one(wheel, 41.0, (1.0,) * 4))
+
+
+@WHEELS
+def test_what_the_road_took_is_reckoned_from_the_wheel_s_own_torque_and_change(wheel):
+    before = remembered(total_nm=one(wheel, -120.0, (0.0,) * 4))
+    _, after = step(measured(-3e3), before)
+    assert [state.road_nm < -1.0 for state in after.wheels] == [i == wheel for i in range(4)]
+    gained = one(wheel, rolling()[wheel] + 5.0, rolling())
+    _, after = step(measured(-3e3, gained), remembered())
+    assert [state.road_nm < -1.0 for state in after.wheels] == [i == wheel for i in range(4)]
+
+
+def test_each_axle_has_its_own_brakes_motors_and_radius():
+    command, after = step(measured(-200e3), remembered(), OFF)
+    motor, friction = command.motor_torque_nm, command.friction_torque_nm
+    assert friction[0] == friction[1] == pytest.approx(-CAR.front.friction_brake.max_torque_nm - motor[0], abs=1e-6)
+    assert friction[2] == friction[3] == pytest.approx(-CAR.rear.friction_brake.max_torque_nm - motor[2], abs=1e-6)
+    assert [state.motor_nm for state in after.wheels] == list(motor)
+    command, _ = step(measured(100e3), remembered(motor_nm=(150.0, 150.0, 150.0, 150.0)), OFF)
+    given_w = [torque * wheel for torque, wheel in zip(command.motor_torque_nm, rolling(), strict=True)]
+    assert given_w == pytest.approx([CAR.front.motor.max_power_w] * 2 + [CAR.rear.motor.max_power_w] * 2)
+
+
+def mirrored(values):
+    a, b, c, d = values
+    return b, a, d, c
+
+
+@settings(max_examples=100)
+@given(
+    st.tuples(*[st.floats(0.5, 1.4)] * 4),
+    st.floats(-60e3, 60e3),
+    st.tuples(*[st.floats(-60.0, 60.0)] * 4),
+    st.tuples(*[st.floats(0.0, 1.0)] * 4),
+    st.tuples(*[st.sampled_from([0.0, 0.5, 1.0])] * 4),
+)
+def test_a_mirrored_car_gets_mirrored_commands(rims, demand, torques, heats, gains):
+    wheels = tuple(rim * rolls for rim, rolls in zip(rims, rolling(), strict=True))
+    one_way = step(measured(demand, wheels, gain=gains), remembered(motor_nm=torques, total_nm=torques, heat=heats))
+    before = remembered(motor_nm=mirrored(torques), total_nm=mirrored(torques), heat=mirrored(heats))
+    other_way = step(measured(demand, mirrored(wheels), gain=mirrored(gains)), before)
+    for name in ("motor_torque_nm", "friction_torque_nm"):
+        assert getattr(one_way[0], name) == pytest.approx(mirrored(getattr(other_way[0], name)), rel=1e-9, abs=1e-6)
+    for here, there in zip(one_way[1].wheels, mirrored(other_way[1].wheels), strict=True):
+        assert here == pytest.approx(there, rel=1e-9, abs=1e-6)
