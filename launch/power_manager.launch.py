@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
 from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
-from launch.conditions import LaunchConfigurationEquals
+from launch.conditions import IfCondition
 from launch.events import matches_action
 from launch.substitutions import EqualsSubstitution, LaunchConfiguration
 from launch_ros.actions import LifecycleNode
@@ -59,7 +59,7 @@ def generate_launch_description() -> LaunchDescription:
             },
         ],
     )
-    managed = LaunchConfigurationEquals("lifecycle", "managed")
+    managed = IfCondition(EqualsSubstitution(chosen["lifecycle"], "managed"))
     configure = EmitEvent(
         event=ChangeState(lifecycle_node_matcher=matches_action(node), transition_id=Transition.TRANSITION_CONFIGURE),
         condition=managed,

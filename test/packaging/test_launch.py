@@ -80,7 +80,7 @@ def of(*kinds: str) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
 def test_every_argument_is_declared_and_explained(description: Any) -> None:
     declared = {args[0]: kwargs for args, kwargs in of("DeclareLaunchArgument")}
     assert all(kwargs["description"].endswith(".") for kwargs in declared.values())
-    used = {args[0] for args, _ in of("LaunchConfiguration", "LaunchConfigurationEquals")}
+    used = {args[0] for args, _ in of("LaunchConfiguration")}
     assert used <= set(declared)
 
 
