@@ -28,6 +28,8 @@ _LARGEST = 1e9
 
 _NODE = "/power_manager"
 _PARAMETERS = "parameters "
+#: What tells the parameters of a power manager of another name.
+_OWN_PARAMETERS = frozenset(("strategy", "policy_file", "vehicle_file", "rate_hz"))
 
 
 class Choice(NamedTuple):
@@ -168,14 +170,15 @@ def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
 
 
 def recorded_parameters(custom_data: Mapping[str, str]) -> dict[str, Any]:
-    """Parameters the bag's power manager ran with; empty if the bag does not say."""
-    for key, text in sorted(custom_data.items()):
-        if key.startswith(_PARAMETERS) and key.endswith(_NODE):
+    """Parameters the bag's power manager ran with, whatever its name was; empty if the bag does not say."""
+    nodes = sorted(custom_data.items(), key=lambda item: (not item[0].endswith(_NODE), item))
+    for key, text in nodes:
+        if key.startswith(_PARAMETERS):
             try:
                 found = json.loads(text)
             except (ValueError, RecursionError):
                 continue
-            if isinstance(found, dict):
+            if isinstance(found, dict) and (key.endswith(_NODE) or set(found) >= _OWN_PARAMETERS):
                 return found
     return {}
 

@@ -21,6 +21,7 @@ from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import SignalStream, check_signals
 from iwm_power_manager.replay.steps import ReconstructedSteps, RecordedSteps, ReplayedStep
+from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.mapping import JOINT_STATE, SignalMapping, topic_named
 from iwm_power_manager.signals.readings import NamedValues, joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import definition_of
@@ -28,6 +29,9 @@ from iwm_power_manager.signals.types import definition_of
 MOTOR_COMMAND = "wheel_torque_command"
 FRICTION_COMMAND = "friction_brake_command"
 STATE = "power_manager/state"
+#: How the state's topic ends, whatever its node is called.
+_STATE_OF_ANY = "/state"
+_STATE_READER = joint_state_reader("position")
 #: What a replay computes anew.
 COMPUTED = (MOTOR_COMMAND, FRICTION_COMMAND, STATE)
 
@@ -93,8 +97,8 @@ class Replay:
     def __init__(self, bag: BagReader, plan: Plan, mapping: SignalMapping, tolerance: float = 0.0) -> None:
         self._bag = bag
         self._plan = plan
-        self._names = {kind: topic_named(kind, bag.topics) for kind in COMPUTED}
-        self._state_topic = _with_messages(bag, self._names[STATE])
+        names = computed_topics(bag)
+        self._state_topic = _with_messages(bag, names.get(STATE))
         self._recorded: RecordedSteps | None = None
         self._reconstructed: ReconstructedSteps | None = None
         self._stream: SignalStream | None = None
@@ -105,13 +109,10 @@ class Replay:
         self._stamps = (0, 0)
         self._comparers = {
             kind: TopicComparer(name, tolerance, YOUNGER_SIGNALS if kind == STATE else ())
-            for kind, name in self._names.items()
-            if name is not None
+            for kind, name in names.items()
         }
         self._decoders = {
-            name: (kind, joint_state_reader("position" if kind == STATE else "effort"))
-            for kind, name in self._names.items()
-            if name is not None
+            name: (kind, joint_state_reader("position" if kind == STATE else "effort")) for kind, name in names.items()
         }
         if self._state_topic is not None:
             self._recorded = RecordedSteps(plan)
@@ -255,15 +256,14 @@ class ReplayOutput:
     def __init__(self, writer: BagWriter, bag: BagReader, plan: Plan) -> None:
         self._writer = writer
         self._sequence = 0
-        computed = {name for kind in COMPUTED if (name := topic_named(kind, bag.topics)) is not None}
+        computed = computed_topics(bag)
         self._copied = {
-            name: writer.add_topic(topic) for name, topic in sorted(bag.topics.items()) if name not in computed
+            name: writer.add_topic(topic) for name, topic in sorted(bag.topics.items()) if name not in computed.values()
         }
         self._numbers = []
         for kind in COMPUTED:
-            name = topic_named(kind, bag.topics)
             new = Topic(f"/{kind}", JOINT_STATE, *definition_of(JOINT_STATE), (DEFAULT_QOS._replace(depth=100),))
-            topic = bag.topics[name] if name is not None else new
+            topic = bag.topics[computed[kind]] if kind in computed else new
             self._numbers.append(writer.add_topic(topic))
         self._wheels = joint_state_writer(plan.wheel_names, "effort")
         self._state = joint_state_writer(SIGNAL_NAMES, "position")
@@ -295,6 +295,39 @@ def exceeds(comparison: Sequence[TopicComparison], tolerance: float) -> bool:
 def decided_values(step: ReplayedStep) -> tuple[float, ...]:
     """Of a step's numbers, those the law decided."""
     return tuple(step.values[_FIRST_DECIDED : _FIRST_DECIDED + len(DECIDED_NAMES)])
+
+
+def computed_topics(bag: BagReader) -> dict[str, str]:
+    """The bag's topics of the commands and the state, by the names of `COMPUTED`; those it does not have are left out.
+
+    The state is private to its node: where the node had another name, it is the one topic `<node>/state` that carries
+    the numbers of a step.
+
+    Raises
+    ------
+    BagError
+        One of them was recorded in several namespaces, or the state of several nodes.
+    """
+    found = {kind: name for kind in COMPUTED if (name := topic_named(kind, bag.topics)) is not None}
+    if STATE not in found:
+        candidates = [
+            name for name, topic in bag.topics.items() if topic.type == JOINT_STATE and name.endswith(_STATE_OF_ANY)
+        ]
+        states = [name for name in candidates if _carries_steps(bag, name)]
+        if len(states) > 1:
+            raise BagError(f"{bag.path}: holds the states of several nodes: {', '.join(sorted(states))}")
+        if states:
+            found[STATE] = states[0]
+    return found
+
+
+def _carries_steps(bag: BagReader, topic: str) -> bool:
+    """Whether the first message of a topic names the signals of a control step."""
+    first = next((message for message in bag.messages() if message.topic == topic), None)
+    try:
+        return first is not None and set(DECIDED_NAMES) - set(YOUNGER_SIGNALS) <= set(_STATE_READER(first.data).names)
+    except UnreadableError:
+        return False
 
 
 def _with_messages(bag: BagReader, topic: str | None) -> str | None:

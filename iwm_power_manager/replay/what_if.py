@@ -21,9 +21,9 @@ from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.replay.plan import Plan
-from iwm_power_manager.replay.run import STATE, Replay
+from iwm_power_manager.replay.run import STATE, Replay, computed_topics
 from iwm_power_manager.signals.contract import WHEEL_NAMES
-from iwm_power_manager.signals.mapping import SignalMapping, topic_named
+from iwm_power_manager.signals.mapping import SignalMapping
 from iwm_power_manager.signals.readings import joint_state_reader
 
 _J_PER_WH = 3600.0
@@ -121,7 +121,7 @@ def what_if(
     vehicle = plans[0][1].vehicle.params
     forces_n: dict[int, float] = {}
     results = []
-    state = topic_named(STATE, bag.topics)
+    state = computed_topics(bag).get(STATE)
     if state is not None and Replay(bag, plans[0][1], mapping).exact:
         meter = EnergyMeter("recorded", vehicle)
         for stamp_ns, step in _recorded_steps(bag, state):

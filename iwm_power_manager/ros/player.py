@@ -25,7 +25,7 @@ from rosgraph_msgs.msg import Clock
 
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.errors import BagError, one_line
-from iwm_power_manager.replay.run import COMPUTED
+from iwm_power_manager.replay.run import computed_topics
 from iwm_power_manager.ros import ending
 from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.messages import CLOCK, clock_message
@@ -180,7 +180,7 @@ class _Player:
 
 def _chosen(bag: BagReader, topics: tuple[str, ...]) -> list[str]:
     if not topics:
-        commands = {topic_named(kind, bag.topics) for kind in COMPUTED}
+        commands = set(computed_topics(bag).values())
         return [name for name in bag.topics if name not in commands and name not in _NOT_PLAYED]
     names = []
     for wanted in topics:

@@ -142,6 +142,55 @@ def test_a_bag_of_before_a_signal_was_added_is_replayed(drive: Path, tmp_path: P
     assert main([str(tmp_path / "old"), "--compare"]) == DONE
 
 
+@pytest.mark.parametrize("name", ["/splitter/state", "/cars/left/splitter/state", "/cars/left/power_manager/state"])
+def test_the_state_of_a_node_of_any_name_is_found(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    """With the parameters under its name, and other topics called `state` beside it."""
+    own = next(key for key in _custom(drive) if key.startswith("parameters "))
+    renamed = {"parameters " + name.removesuffix("/state"): _custom(drive)[own], "parameters /a": '{"rate_hz": 1.0}'}
+    foreign = joint_state_writer(("arm",), "position")
+    with BagReader(drive) as old, BagWriter(tmp_path / "renamed", custom_data=renamed) as new:
+        numbers = {
+            topic: new.add_topic(found._replace(name=name) if topic.endswith(STATE) else found)
+            for topic, found in old.topics.items()
+        }
+        state = next(found for topic, found in old.topics.items() if topic.endswith(STATE))
+        others = [new.add_topic(state._replace(name=f"/{arm}/state")) for arm in ("arm", "broken", "silent")]
+        for i, message in enumerate(old.messages()):
+            if i == 3:
+                new.write(others[0], message.log_time_ns, foreign(0, (1.0,)))
+                new.write(others[1], message.log_time_ns, b"nothing")
+            new.write(
+                numbers[message.topic], message.log_time_ns, message.data, message.publish_time_ns, message.sequence
+            )
+    assert main([str(tmp_path / "renamed"), "--compare", "--json", "-"]) == DONE
+    report = result(capsys)
+    assert (report["exact"], report["steps"]) == (True, COUNT)
+    assert main([str(tmp_path / "renamed"), "--output", str(tmp_path / "again")]) == DONE
+    with BagReader(tmp_path / "again") as again:
+        assert name in again.topics and not any(topic == f"/{STATE}" for topic in again.topics)
+
+
+def test_the_states_of_two_nodes_are_refused_by_name(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagReader(drive) as old, BagWriter(tmp_path / "two") as new:
+        (state,) = (found for topic, found in old.topics.items() if topic.endswith(STATE))
+        numbers = [new.add_topic(state._replace(name=f"/{node}/state")) for node in ("a", "b")]
+        for message in old.messages():
+            if message.topic == state.name:
+                for number in numbers:
+                    new.write(number, message.log_time_ns, message.data)
+    assert main([str(tmp_path / "two")]) == BAD_INPUT
+    assert "holds the states of several nodes: /a/state, /b/state" in capsys.readouterr().err
+
+
+def _custom(path: Path) -> dict[str, str]:
+    with BagReader(path) as bag:
+        return dict(bag.custom_data)
+
+
 def test_a_policy_changed_in_its_place_is_caught(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "policy.npz"
     policy = load_policy(share_path(f"policies/{POLICY}"))
