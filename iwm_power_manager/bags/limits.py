@@ -154,5 +154,5 @@ def decompress_file(path: Path, target: Path) -> str:
     except OSError as error:
         raise BagError(f"{path}: cannot be decompressed: {error.strerror or error}") from None
     if not written:
-        raise BagError(f"{path}: {problem or 'is empty'}")
+        raise BagError(f"{path}: {problem or 'holds nothing that can be decompressed'}")
     return problem

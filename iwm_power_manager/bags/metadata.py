@@ -136,7 +136,7 @@ def information_of(text: str) -> dict[str, Any]:
     try:
         # Aliases stay references to one object, and nothing here walks them. CSafeLoader builds plain values only.
         content = yaml.load(text, _Loader)  # noqa: S506
-    except (yaml.YAMLError, ValueError, RecursionError, AttributeError, TypeError):
+    except Exception:  # noqa: BLE001 - constructors of dates, numbers and booleans raise anything at a text that is none
         return {}
     if isinstance(content, dict):
         content = content.get("rosbag2_bagfile_information", content)

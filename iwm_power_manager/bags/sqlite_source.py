@@ -19,13 +19,23 @@ from typing import Any
 
 from mcap.records import Header
 
-from iwm_power_manager.bags.limits import SQLITE_INSTRUCTIONS, SQLITE_INSTRUCTIONS_PER_BYTE, regular_file
+from iwm_power_manager.bags.limits import (
+    MAX_CHUNK_BYTES,
+    SQLITE_INSTRUCTIONS,
+    SQLITE_INSTRUCTIONS_PER_BYTE,
+    regular_file,
+)
 from iwm_power_manager.bags.mcap_records import ChannelMessage
 from iwm_power_manager.bags.metadata import Topic, parse_qos
 from iwm_power_manager.errors import BagError
 
 _STEP = 100_000
-_ROWS = "SELECT topic_id, timestamp, data, id FROM messages"
+#: What holds content and does not compute it: no views, no virtual tables (no page), no generated columns (hidden).
+_TABLES = """
+    SELECT name FROM sqlite_master AS found WHERE type = 'table' AND rootpage > 0
+    AND NOT EXISTS (SELECT 1 FROM pragma_table_xinfo(found.name) WHERE hidden <> 0)
+"""
+_ROWS = "SELECT topic_id, timestamp, data, rowid FROM messages"
 
 
 class SqliteSource:
@@ -44,11 +54,12 @@ class SqliteSource:
             self._database = stack.enter_context(closing(sqlite3.connect(address, uri=True)))
             self._database.row_factory = sqlite3.Row
             self._database.text_factory = lambda text: text.decode("utf-8", "replace")
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
             self._database.set_progress_handler(self._out_of_steps, _STEP)
             self._database.execute("PRAGMA trusted_schema = OFF")
             # A truncated file is refused as a whole, unless one says that one knows.
             self._database.execute("PRAGMA writable_schema = ON")
-            tables = {name for (name,) in self._database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            tables = {name for (name,) in self._database.execute(_TABLES)}
             if not tables >= {"topics", "messages"}:
                 raise BagError(f"{path}: is no rosbag2 sqlite3 bag")
             self._definitions = self._read_definitions() if "message_definitions" in tables else {}
@@ -73,8 +84,10 @@ class SqliteSource:
         """All messages in the order of their log times, of a damaged file in the order of recording."""
         bad = 0
         last: tuple[Any, Any] = (-1, -1)
-        queries = [f"{_ROWS} ORDER BY timestamp, id"] if not self.damage else []
-        queries.append(f"{_ROWS} WHERE (timestamp, id) > (?, ?) ORDER BY id")  # without an index, which may be damaged
+        queries = [f"{_ROWS} ORDER BY timestamp, rowid"] if not self.damage else []
+        queries.append(
+            f"{_ROWS} WHERE (timestamp, rowid) > (?, ?) ORDER BY rowid"
+        )  # without an index, which may be damaged
         for query in queries:
             try:
                 for number, log_time, data, row in self._database.execute(query, last if "?" in query else ()):

@@ -37,6 +37,8 @@ from iwm_power_manager.signals.types import Types, types_of
 #: Messages from a bag's start that show whether its stamps advance, and how many may have the same one.
 _PROBE_MESSAGES = 2000
 _STANDING = 10
+#: No clock is so many times slower than the one of the log; one that counts milliseconds is.
+_SLOW = 100
 
 FloatArray = NDArray[np.float64]
 
@@ -139,16 +141,14 @@ class SignalStream:
 
         Returns the line that says so; "" where stamps are used.
         """
-        stamps: dict[str, list[int]] = {}
+        stamps: dict[str, list[tuple[int, int]]] = {}
         for message in itertools.islice(self._bag.messages(), _PROBE_MESSAGES):
             for value in self.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns):
                 if value.stamped:
-                    stamps.setdefault(message.topic, []).append(value.reading.stamp_ns)
+                    stamps.setdefault(message.topic, []).append((value.reading.stamp_ns, value.log_time_ns))
         self.taken.clear()
         self.bad.clear()
-        standing = sorted(
-            topic for topic, found in stamps.items() if len(found) > 2 and len(set(found)) * _STANDING < len(found)
-        )
+        standing = sorted(topic for topic, found in stamps.items() if len(found) > 2 and not _advance(found))
         if not standing:
             return ""
         self._by_stamp = False
@@ -187,6 +187,15 @@ class SignalStream:
             stamped = False
             readings = tuple(reading._replace(stamp_ns=log_time_ns) for reading in readings)
         return [Recorded(log_time_ns, publish_time_ns, stamped, reading) for reading in readings]
+
+
+def _advance(times: Sequence[tuple[int, int]]) -> bool:
+    """Whether stamps go on, most of them forward, and not a hundred times slower than the log times beside them."""
+    stamps = [stamp_ns for stamp_ns, _ in times]
+    forward = sum(after > before for before, after in itertools.pairwise(stamps))
+    backward = sum(after < before for before, after in itertools.pairwise(stamps))
+    spans = [max(column) - min(column) for column in zip(*times, strict=True)]
+    return len(set(stamps)) * _STANDING >= len(stamps) and forward > backward and spans[0] * _SLOW >= spans[1]
 
 
 def _types(bag: BagReader, name: str) -> Types:

@@ -54,6 +54,7 @@ class ReplayReport(NamedTuple):
     messages : read
     steps : control steps taken
     first_stamp_ns, last_stamp_ns : of the steps
+    span_ns : driven: from each step to the next, jumps back left out
     gaps : times at which steps are missing in the record, so that the law's memory is unknown
     restarts : pauses in the inputs after which the law started anew
     bad_messages : messages that could not be decoded
@@ -69,6 +70,7 @@ class ReplayReport(NamedTuple):
     steps: int
     first_stamp_ns: int
     last_stamp_ns: int
+    span_ns: int
     gaps: int
     restarts: int
     bad_messages: int
@@ -107,6 +109,7 @@ class Replay:
         self._messages = 0
         self._steps = 0
         self._stamps = (0, 0)
+        self._span_ns = 0
         self._comparers = {
             kind: TopicComparer(name, tolerance, YOUNGER_SIGNALS if kind == STATE else ())
             for kind, name in names.items()
@@ -140,11 +143,12 @@ class Replay:
             if progress is not None and self._messages % PROGRESS_EVERY == 0:
                 progress(self._messages, message.log_time_ns)
             steps = self._take(message)
-            if steps:
-                self._stamps = (self._stamps[0] if self._steps else steps[0].stamp_ns, steps[-1].stamp_ns)
-                self._steps += len(steps)
-                for step in steps:
-                    self._compare(step)
+            for step in steps:
+                first_ns, last_ns = self._stamps if self._steps else (step.stamp_ns, step.stamp_ns)
+                self._span_ns += max(step.stamp_ns - last_ns, 0)
+                self._stamps = (first_ns, step.stamp_ns)
+                self._steps += 1
+                self._compare(step)
             yield message, steps
 
     def report(self) -> ReplayReport:
@@ -156,6 +160,7 @@ class Replay:
             self._messages,
             self._steps,
             *self._stamps,
+            self._span_ns,
             self._recorded.gaps if self._recorded else 0,
             self._reconstructed.restarts if self._reconstructed else 0,
             self._bad_messages + (self._stream.bad_messages if self._stream else 0),

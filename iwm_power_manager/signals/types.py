@@ -111,6 +111,7 @@ def _types_of(msgtype: str, encoding: str, text: str, wide: str) -> Types:
 
     try:
         name = _normalised(msgtype)
+        encoding = IDL if encoding == "omgidl" else encoding
         known: dict[str, Any] = _parsed(name, encoding, text) if text and encoding in (MSG, IDL) else {}
         given = _needed(name, known, wide)
         _measure(name, given)

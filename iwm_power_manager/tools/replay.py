@@ -246,7 +246,7 @@ def _is_other_policy(bag: BagReader, plan: Plan) -> bool:
 
 
 def _report_lines(bag: BagReader, report: ReplayReport, elapsed_s: float) -> list[str]:
-    span_s = (report.last_stamp_ns - report.first_stamp_ns) * 1e-9
+    span_s = report.span_ns * 1e-9
     how = "repeated from the recorded state" if report.exact else "made from the recorded inputs"
     lines = [
         f"{bag.path}: {report.messages} messages, {report.steps} steps over {span_s:.2f} s, {how}, "

@@ -129,6 +129,50 @@ def test_a_view_that_never_ends_is_not_asked(tmp_path: Path) -> None:
         contents(folder)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        "ALTER TABLE topics ADD COLUMN note TEXT GENERATED ALWAYS AS (hex(zeroblob(100000000))) VIRTUAL",
+        "ALTER TABLE messages ADD COLUMN more BLOB AS(zeroblob(100000000))",
+    ],
+)
+def test_a_table_that_computes_its_content_is_not_asked(tmp_path: Path, change: str) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(5))
+    with sqlite3.connect(folder / "a_0.db3") as database:
+        database.execute(change)
+    database.close()
+    with pytest.raises(BagError, match="is no rosbag2 sqlite3 bag"):
+        contents(folder)
+
+
+def test_rows_that_are_no_messages_are_counted_and_a_table_without_numbers_is_read(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(10))
+    with sqlite3.connect(folder / "a_0.db3") as database:
+        database.execute("CREATE TABLE rows AS SELECT topic_id, timestamp, data FROM messages")
+        database.execute("DROP TABLE messages")
+        database.execute("ALTER TABLE rows RENAME TO messages")
+        database.execute("UPDATE messages SET timestamp = 'x' WHERE rowid = 3")
+        database.execute("UPDATE messages SET timestamp = -7 WHERE rowid = 4")
+        database.execute("UPDATE messages SET data = 'text' WHERE rowid = 5")
+    database.close()
+    count, damage = contents(folder)
+    assert (count, damage) == (27, [f"{folder / 'a_0.db3'}: 3 row(s) hold no message of a known topic"])
+
+
+def test_a_compressed_file_that_holds_nothing_says_why(tmp_path: Path) -> None:
+    path = tmp_path / "a_0.mcap.zstd"
+    path.write_bytes(foreign.write_mcap(tmp_path / "a.mcap", foreign.drive(5)).read_bytes())
+    with pytest.raises(BagError, match=r"a_0\.mcap\.zstd: is damaged: zstd decompress error: Unknown frame"):
+        contents(path)
+
+
+def test_a_data_file_is_what_its_first_bytes_say(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(5))
+    (folder / "a_0.db3").rename(tmp_path / "renamed.mcap")
+    foreign.write_mcap(tmp_path / "a.mcap", foreign.drive(5)).rename(tmp_path / "renamed.db3")
+    assert contents(tmp_path / "renamed.mcap") == contents(tmp_path / "renamed.db3") == (15, [])
+
+
 def test_a_query_that_takes_too_long_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from iwm_power_manager.bags import sqlite_source
 
@@ -267,6 +311,7 @@ def mutations(draw: st.DrawFn) -> Callable[[bytes], bytes]:
 @given(mutate=mutations())
 @example(mutate=lambda content: content[: len(content) // 2] + bytes(16) + content[len(content) // 2 :])
 @example(mutate=lambda _: MAGIC)
+@example(mutate=lambda _: b"rosbag2_bagfile_information: {version: !!bool maybe}")
 @example(mutate=lambda _: b"rosbag2_bagfile_information: &a {custom_data: *a, relative_file_paths: [a.mcap]}")
 @example(mutate=lambda _: b"a: &a [x,x]\nb: &b [*a,*a,*a,*a]\nc: &c [*b,*b,*b,*b]\nd: [*c,*c,*c]\n" + b"e: [" * 500)
 def test_no_damaged_file_whatever_ends_in_anything_but_messages_or_one_line(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +47,10 @@ def with_speed(**changes: str) -> list[foreign.Channel]:
         with_speed(),
         with_speed(type="my_msgs/Speed"),
         with_speed(text=SPEED.text.replace("\n", "\r\n")),
+        with_speed(text="\ufeff" + SPEED.text.replace(" ", "\t")),
         with_speed(text=foreign.IDL_TEXT, encoding="ros2idl"),
     ],
-    ids=["as written", "two-part name", "CRLF", "IDL"],
+    ids=["as written", "two-part name", "CRLF", "BOM and tabs", "IDL"],
 )
 def test_a_type_of_another_package_is_read_by_the_definition_in_the_bag(
     tmp_path: Path, mapping: Path, channels: list[foreign.Channel]
@@ -87,11 +89,20 @@ def test_a_missing_nested_definition_is_one_line_with_topic_and_type(
         assert sum(message.topic != "/car/speed" for message in reader.messages()) == 2 * COUNT
 
 
-@pytest.mark.parametrize("stamp", [0, 1_234_567_890], ids=["zero", "standing"])
+@pytest.mark.parametrize(
+    "stamp",
+    [
+        lambda _: 0,
+        lambda _: 1_234_567_890,
+        lambda log_ns: log_ns // 10**6,
+        lambda log_ns: 2 * foreign.START_NS - log_ns,
+    ],
+    ids=["zero", "standing", "milliseconds", "backwards"],
+)
 def test_stamps_that_do_not_advance_are_said_once_and_log_times_are_used(
-    tmp_path: Path, mapping: Path, stamp: int, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, mapping: Path, stamp: Callable[[int], int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bag = write_bag(tmp_path / "bag", drive(stamp=lambda _: stamp))
+    bag = write_bag(tmp_path / "bag", drive(stamp=stamp))
     arguments = [str(bag), "--mapping", str(mapping), "--strategy", "equal"]
     assert main(arguments) == DONE
     out = capsys.readouterr().out
