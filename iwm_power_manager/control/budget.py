@@ -6,10 +6,15 @@ one; one by a quarter of the power or more counts as one, a smaller one in propo
 The price of a change goes by the mean of the three. What is budgeted is the second: it is never less than the number of
 changes by more than a quarter, and swinging just around that is no way out.
 
-Every change fills a bucket that leaks at the rate of the budget. A share whose change does not fit is not offered: so
-no minute sees more than the budget and one bucket, and no hour more than sixty budgets and one bucket, whatever is
-driven. Long before it comes to that, the price rises with the level: being stuck with a share costs far more than a
-change that was not worth it. At `DEAREST` times the price hardly any change pays, and the bucket is not full yet.
+Every change fills a bucket that leaks at the rate of the budget. A share whose change does not fit, or from which the
+way back to the middle would not fit, is not offered: so no minute sees more than the budget and one bucket, no hour
+more than sixty budgets and one bucket, whatever is driven, and nothing can hold the split at a share that has become
+wrong.
+
+The price of a change is the multiplier of the constrained problem. A constant one is optimal: it is the solver's, while
+the bucket is empty. It rises with what is used, and slowly, as an integral controller of the multiplier: in proportion
+to the level in the logarithm, to `DEAREST` times at a full bucket, where hardly any change pays (docs/solver.md derives
+the rate and what it costs).
 """
 
 from __future__ import annotations
@@ -22,11 +27,9 @@ WHOLE_CHANGE = 0.25
 DEARER = (3.0, 9.0)
 DEAREST = DEARER[-1]
 
-
-#: The bucket holds this many minutes' budget, one change at least.
-BUCKET_MIN = 1.5
-#: Level, as part of the bucket, up to which the price stays; and from which on it is `DEAREST` times as high.
-CALM, FULL_PRICE = 1.0 / 6.0, 0.78
+#: The bucket holds this many minutes' budget; at least one change and the way back.
+BUCKET_MIN = 2.0
+_ROUNDING = 1e-9
 
 
 @kernel
@@ -46,7 +49,7 @@ def price_units(move: float) -> float:
 @kernel
 def bucket(changes_per_min: float) -> float:
     """Changes the bucket holds."""
-    return max(BUCKET_MIN * changes_per_min, 1.0)
+    return max(BUCKET_MIN * changes_per_min, 2.0)
 
 
 @kernel
@@ -56,9 +59,12 @@ def leaked(used: float, seconds: float, changes_per_min: float) -> float:
 
 
 @kernel
-def affordable(move: float, used: float, changes_per_min: float) -> bool:
-    """Whether the bucket has room for a move of the share. Without a budget everything is."""
-    return changes_per_min <= 0.0 or move == 0.0 or used + changes_counted(move) <= bucket(changes_per_min)
+def affordable(share: float, previous: float, used: float, changes_per_min: float) -> bool:
+    """Whether the bucket has room for a new share, and for the way back to the middle. Without a budget it has."""
+    if changes_per_min <= 0.0 or share == previous:
+        return True
+    level = used + changes_counted(share - previous) + changes_counted(0.5 - share)
+    return level <= bucket(changes_per_min) + _ROUNDING
 
 
 @kernel
@@ -66,5 +72,4 @@ def price_level(used: float, changes_per_min: float) -> float:
     """Where the price stands between the tabulated ones: 0 the solver's, 1 and 2 those of `DEARER`; in proportion."""
     if changes_per_min <= 0.0:
         return 0.0
-    rise = (used / bucket(changes_per_min) - CALM) / (FULL_PRICE - CALM)
-    return min(max(rise, 0.0), 1.0) * len(DEARER)
+    return min(used / bucket(changes_per_min), 1.0) * len(DEARER)

@@ -9,6 +9,11 @@ signal itself wanders): noise alone goes back the way it came. Its steady Kalman
 new value that lasts. The strategy then judges a share by the mean over the latest demands, weighted K (1 - K)^age,
 instead of by the present one. It averages costs, not demands: the cost of a jittering demand is not that of its mean.
 
+The noise goes on. The cost-to-go of a policy that knows none would answer the next jump with a change; what really
+happens is that the share is held and meets the same jumps again. So the mean cost of a step counts for as long as the
+estimate is good: until the signal, which wanders q = s2 K^2 / (1 - K) a sample, is on average over that time as
+uncertain as the estimate, s2 K. That is 2 (1 - K) / K samples; the cost-to-go counts from then on.
+
 Where no noise can be told from chance, which is every drive without any, K is 1 and nothing is averaged.
 """
 
@@ -75,6 +80,12 @@ def lasting_gain(variance: float, covariance: float) -> float:
         return 1.0
     ratio = max(variance + 2.0 * covariance, 0.0) / -covariance
     return max(0.5 * (math.sqrt(ratio * ratio + 4.0 * ratio) - ratio), _LEAST_GAIN)
+
+
+@kernel
+def held_s(gain: float) -> float:
+    """How long a share that was judged by a mean over noise meets the same noise, s."""
+    return 2.0 * (1.0 - gain) / gain * SAMPLE_S
 
 
 @kernel

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control import law
 from iwm_power_manager.control import types as t
+from iwm_power_manager.control.budget import bucket
 from iwm_power_manager.control.persistence import no_jitter
 from iwm_power_manager.control.settings import (
     GATE_MODE_LIMITER,
@@ -629,8 +630,8 @@ def test_no_minute_sees_more_changes_than_the_budget_and_one_bucket_whatever_is_
             changes.append(k * 0.01)
             share = command.decided_share
     busiest = max(sum(start <= at < start + 60.0 for at in changes) for start in changes)
-    assert 5 < busiest <= 8.0 + 1.5 * 8.0
-    assert len(changes) <= 3 * 8.0 + 1.5 * 8.0
+    assert 5 < busiest <= 8.0 + bucket(8.0)
+    assert len(changes) <= 3 * 8.0 + bucket(8.0)
 
 
 def test_equal_split_at_ease_gives_each_motor_a_quarter():

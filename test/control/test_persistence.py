@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from iwm_power_manager.control.persistence import Jitter, lasting_gain, no_jitter, observed
+from iwm_power_manager.control.persistence import Jitter, held_s, lasting_gain, no_jitter, observed
 
 
 def watched(demand_w: np.ndarray, step_s: float = 0.01) -> Jitter:
@@ -56,6 +56,14 @@ def test_the_latest_second_is_remembered_newest_first():
     found = watched(np.arange(3000.0))
     assert found.samples_w == tuple(2990.0 - 10.0 * age for age in range(10))
     assert found.age_s == pytest.approx(0.09)
+
+
+def test_without_noise_nothing_is_held_and_with_noise_until_the_signal_is_as_uncertain_as_the_estimate():
+    assert held_s(1.0) == 0.0
+    noise, gain = 1.0, 0.2
+    wander = noise * gain**2 / (1.0 - gain)
+    samples = held_s(gain) / 0.1
+    assert wander * samples / 2.0 == pytest.approx(noise * gain)
 
 
 def test_nothing_is_known_before_the_first_demand():

@@ -198,7 +198,7 @@ def test_a_share_from_a_table_stays_within_0_and_1():
     st.floats(-0.15, 0.15),
     st.floats(-0.15, 0.15),
     SHARE,
-    st.sampled_from([0.0, 1.9, 4.0, 8.0, 11.2, 12.0]),
+    st.sampled_from([0.0, 1.9, 4.0, 8.0, 14.2, 15.0, 16.0]),
 )
 def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, rear, previous, used):
     def outcome(share):
@@ -209,6 +209,26 @@ def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, re
         ours = lookahead_share(power, speed, front, rear, previous, used, CAR, table)
         costs = splits.bellman((power, speed, front, rear), previous, table, outcome, used)
         assert within_rounding(costs, ours, 1e-6)
+
+
+def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_noise_lasts():
+    gain, latest, demand = 0.5, (4000.0, 9000.0, 1000.0), 6000.0
+    jitter = no_jitter()._replace(samples_w=latest + (0.0,) * 7, taken=3, gain=gain)
+    at = situation(demand, previous=0.3)._replace(jitter=jitter)
+    ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, TABLE)
+    # Two samples more at this gain: 0.2 s, for which the step's cost goes on.
+    steps = 1.0 + 0.2 / TABLE.problem.dt_s
+    weights = gain * (1.0 - gain) ** np.arange(4)
+    total = dict.fromkeys((0.3, *TABLE.share), 0.0)
+    for power, weight in zip((demand, *latest), weights / weights.sum(), strict=True):
+
+        def outcome(share, power=power):
+            step = step_cost_and_next(power, 12.0, 0.0, 0.0, share, CAR, TABLE.problem)
+            return step.cost_j, step.speed_mps, step.slip_front, step.slip_rear
+
+        for share, cost in splits.bellman((power, 12.0, 0.0, 0.0), 0.3, TABLE, outcome, steps=steps).items():
+            total[share] += weight * cost
+    assert within_rounding(total, ours, 1e-6)
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(2, 1.0), (2, -1.0), (3, 1.0), (3, -1.0)])
@@ -287,9 +307,9 @@ def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_
         return lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.6, used, CAR, table._replace(switching_cost_j=price)) != 0.6
 
     prices = np.geomspace(1e-3, 1e4, 200)
-    dearest = [max((p for p in prices if moves(p, used)), default=0.0) for used in (0.0, 2.0, 5.0, 9.0, 12.0)]
-    assert dearest[0] == dearest[1] > dearest[2] > dearest[3] > dearest[4] == 0.0
-    assert dearest[1] / dearest[3] == pytest.approx(3.0 ** (2.0 * (9.0 / 12.0 - 1 / 6) / (0.78 - 1 / 6)), rel=0.15)
+    dearest = [max((p for p in prices if moves(p, used)), default=0.0) for used in (0.0, 4.0, 8.0, 14.0, 16.0)]
+    assert dearest[0] > dearest[1] > dearest[2] > dearest[3] > dearest[4] == 0.0
+    assert dearest[0] / dearest[3] == pytest.approx(9.0 ** (14.0 / 16.0), rel=0.15)
 
 
 def test_a_demand_that_jitters_is_judged_by_the_mean_of_what_it_jitters_between():

@@ -87,17 +87,18 @@ def price_units(move):
     return 0.0 if move == 0.0 else (1.0 + min(abs(move) / 0.25, 1.0) + abs(move)) / 3.0
 
 
-def bellman(point, previous, table, outcome, used=0.0):
+def bellman(point, previous, table, outcome, used=0.0, steps=1.0):
     """Cost of each share: step, change, and what follows (eq. 31). `outcome(share)` is the step's (cost, v, f, r).
 
     `used` is what is used of the budget of changes: the tables at dearer prices count for more, the more that is.
+    `steps` is how many times the step counts.
     """
     axes = (table.power_w, table.speed_mps, table.slip_front, table.slip_rear, table.previous_share)
     budget = table.changes_per_min
     tables, level, factor = [table.expected_cost_j, *table.dearer_cost_j], 0.0, 1.0
     if budget > 0.0:
-        full = max(1.5 * budget, 1.0)
-        level = float(np.interp(used / full, [1.0 / 6.0, 0.78], [0.0, 2.0]))
+        full = max(2.0 * budget, 2.0)
+        level = 2.0 * min(used / full, 1.0)
         factor = 3.0**level
     costs = {}
     for share in (previous, *table.share):
@@ -105,10 +106,11 @@ def bellman(point, previous, table, outcome, used=0.0):
         at = (point[0], speed, front, rear, share)
         follow_up = np.interp(level, range(len(tables)), [interpolated(axes, each, at) for each in tables])
         move = share - previous
-        if budget > 0.0 and move != 0.0 and used + min(abs(move) / 0.25, 1.0) > full:
+        way_back = min(abs(0.5 - share) / 0.25, 1.0)
+        if budget > 0.0 and move != 0.0 and used + min(abs(move) / 0.25, 1.0) + way_back > full + 1e-9:
             continue
         units = price_units(move) if budget > 0.0 else abs(move)
         changed = factor * table.switching_cost_j * units + table.switching_fixed_cost_j * (move != 0.0)
-        costs.setdefault(share, cost + changed + table.discount * follow_up)
+        costs.setdefault(share, steps * cost + changed + table.discount * follow_up)
     costs[previous] -= TELLS_APART_W * table.problem.dt_s
     return costs

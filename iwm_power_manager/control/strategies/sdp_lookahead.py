@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from iwm_power_manager.control.budget import DEAREST, affordable, price_level, price_units
-from iwm_power_manager.control.persistence import SAMPLES
+from iwm_power_manager.control.persistence import SAMPLES, held_s
 from iwm_power_manager.control.strategies.instantaneous import LEAST_DIFFERENCE_W
 from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import PolicyTable
@@ -41,7 +41,7 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
     for k in range(policy.share.size):
         share = policy.share[k]
         move = share - previous
-        if move == 0.0 or not affordable(move, used, policy.changes_per_min):
+        if move == 0.0 or not affordable(share, previous, used, policy.changes_per_min):
             continue
         switching = price * (price_units(move) if budgeted else abs(move)) + policy.switching_fixed_cost_j
         cost = _cost_j(situation, share, level, vehicle, policy) + switching
@@ -55,15 +55,16 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
 def _cost_j(situation: Situation, share: float, level: float, vehicle: VehicleParams, policy: PolicyTable) -> float:
     """Cost of a step with this share and of all that follows, J, in the mean over what the demand jitters between."""
     gain = situation.jitter.gain
-    now = _demand_cost_j(situation.power_demand_w, situation, share, level, vehicle, policy)
     if gain > _LASTING:
-        return now
-    total = gain * now
+        return _demand_cost_j(situation.power_demand_w, situation, share, level, 1.0, vehicle, policy)
+    steps = 1.0 + held_s(gain) / policy.problem.dt_s
+    total = gain * _demand_cost_j(situation.power_demand_w, situation, share, level, steps, vehicle, policy)
     weights = gain
     weight = gain
     for i in range(min(SAMPLES, situation.jitter.taken)):
         weight *= 1.0 - gain
-        total += weight * _demand_cost_j(situation.jitter.samples_w[i], situation, share, level, vehicle, policy)
+        sample_w = situation.jitter.samples_w[i]
+        total += weight * _demand_cost_j(sample_w, situation, share, level, steps, vehicle, policy)
         weights += weight
     return total / weights
 
@@ -74,10 +75,14 @@ def _demand_cost_j(
     situation: Situation,
     share: float,
     level: float,
+    steps: float,
     vehicle: VehicleParams,
     policy: PolicyTable,
 ) -> float:
-    """Right-hand side of eq. 31 for one demand and one share, J, without the price of the change."""
+    """Right-hand side of eq. 31 for one demand and one share, J, without the price of the change.
+
+    `steps` is how many times the step's cost counts.
+    """
     outcome = step_cost_and_next(
         power_demand_w,
         situation.speed_mps,
@@ -100,7 +105,7 @@ def _demand_cost_j(
         follow_up = interpolate5(low, a, fa, b, fb, c, fc, d, fd, e, fe)
         high = interpolate5(policy.dearer_cost_j[upper], a, fa, b, fb, c, fc, d, fd, e, fe)
         follow_up += (level - upper) * (high - follow_up)
-    return outcome.cost_j + policy.discount * follow_up
+    return steps * outcome.cost_j + policy.discount * follow_up
 
 
 STRATEGY = Strategy("sdp_lookahead", 5, choose, needs_policy=True)
