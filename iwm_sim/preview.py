@@ -16,8 +16,13 @@ from iwm_power_manager.control.strategies.instantaneous import PRICE_OF_MISSING
 from iwm_power_manager.jit import kernel, parallel_kernel
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
+from iwm_sim.metrics import share_changes
 
 FloatArray = npt.NDArray[np.float64]
+
+#: Between these the price is bisected that keeps a number of changes, in the logarithm.
+_PRICES_J = (1e-2, 1e6)
+_BISECTIONS = 12
 
 
 @parallel_kernel
@@ -67,35 +72,6 @@ def cheapest_path(cost_j, share, switching_cost_j, switching_fixed_cost_j, path)
         last = origin[k, last]
 
 
-def schedule(
-    power_w: FloatArray,
-    speed_mps: FloatArray,
-    dt_s: float,
-    decision_period_s: float,
-    vehicle: VehicleParams,
-    friction: float,
-    share: FloatArray,
-    switching_cost_j: float = 0.0,
-    switching_fixed_cost_j: float = 0.0,
-) -> FloatArray:
-    """Best front share for each decision of a drive whose demand and speed are known from its start to its end.
-
-    Parameters
-    ----------
-    power_w, speed_mps : float64[n], demand and speed in each control step, as a drive of the same cycle had them
-    dt_s, decision_period_s : control step and decision period; the latter a multiple of the former
-    vehicle, friction : what is driven, and on what
-    share : float64[U], shares to choose from
-    switching_cost_j, switching_fixed_cost_j : see `cheapest_path`
-
-    Returns
-    -------
-    float64[ceil(n * dt_s / decision_period_s)]
-    """
-    cost = step_costs(power_w, speed_mps, dt_s, decision_period_s, vehicle, friction, share)
-    return cheapest_schedule(cost, share, switching_cost_j, switching_fixed_cost_j)
-
-
 def step_costs(
     power_w: FloatArray,
     speed_mps: FloatArray,
@@ -105,7 +81,19 @@ def step_costs(
     friction: float,
     share: FloatArray,
 ) -> FloatArray:
-    """Cost of each share in each decision of a known drive, J: float64[ceil(n * dt_s / decision_period_s), U]."""
+    """Cost of each share in each decision of a drive whose demand and speed are known from its start to its end, J.
+
+    Parameters
+    ----------
+    power_w, speed_mps : float64[n], demand and speed in each control step, as a drive of the same cycle had them
+    dt_s, decision_period_s : control step and decision period; the latter a multiple of the former
+    vehicle, friction : what is driven, and on what
+    share : float64[U], shares to choose from
+
+    Returns
+    -------
+    float64[ceil(n * dt_s / decision_period_s), U]
+    """
     samples = round(decision_period_s / dt_s)
     cost = np.empty((-(-power_w.size // samples), share.size))
     _tabulate(power_w, speed_mps, samples, share, friction, dt_s, vehicle, cost)
@@ -115,10 +103,22 @@ def step_costs(
 def cheapest_schedule(
     cost_j: FloatArray, share: FloatArray, switching_cost_j: float = 0.0, switching_fixed_cost_j: float = 0.0
 ) -> FloatArray:
-    """Share of each decision with the least sum of costs and prices of changes."""
+    """Share of each decision with the least sum of costs and prices of changes (see `cheapest_path`)."""
     path = np.empty(cost_j.shape[0], dtype=np.int64)
     cheapest_path(cost_j, share, switching_cost_j, switching_fixed_cost_j, path)
     return share[path]
+
+
+def cheapest_within(cost_j: FloatArray, share: FloatArray, most_changes: float) -> FloatArray:
+    """The cheapest schedule of those with a constant price of a move and at most so many changes (`share_changes`)."""
+    low, high = _PRICES_J
+    for _ in range(_BISECTIONS):
+        price = float(np.sqrt(low * high))
+        if share_changes(cheapest_schedule(cost_j, share, price)) > most_changes + 1e-6:
+            low = price
+        else:
+            high = price
+    return cheapest_schedule(cost_j, share, high)
 
 
 def fit_rule(power_w: FloatArray, front_share: FloatArray, least_power_w: float = 200.0) -> FloatArray:

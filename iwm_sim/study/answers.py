@@ -149,7 +149,7 @@ WORDS = {
     "GRDP, rule": "the paper's generalized rule: straight lines fitted to dynamic programming on FTP-75",
     "paper_sdp": "the paper's stochastic program on the paper's grid, decided every 0.1 s",
     "ours": "strategy sdp_lookahead: one step ahead on the cost-to-go of grid coupled, decided every 0.02 s",
-    "preview": "dynamic programming with the whole cycle known in advance; its price of a change is named beside it",
+    "preview": "dynamic programming with the whole cycle known in advance; its budget or price of changes is beside it",
     "instantaneous": "least battery power now; instantaneous_slip counts slip and load transfer, and a change has to "
     "save the power named beside it",
     "share": "front power over power demand, 0..1; a change of it by more than 0.25 counts",

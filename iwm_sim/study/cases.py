@@ -76,6 +76,7 @@ class Case:
     policy : policy file; "" if the strategy needs none
     rule : coefficients of strategy `rule`
     switching_cost_j, switching_fixed_cost_j : of strategy `preview`
+    changes_per_min : of strategy `preview`: a budget of changes, whose price is found; 0 takes the prices
     dt_s, substeps : control step, plant steps in it
     soc : at the start
     assumed_friction : what the law is told; None is the truth
@@ -96,6 +97,7 @@ class Case:
     rule: tuple[float, ...] = ()
     switching_cost_j: float = 0.0
     switching_fixed_cost_j: float = 0.0
+    changes_per_min: float = 0.0
     dt_s: float = 0.01
     substeps: int = 1
     soc: float = 0.8
@@ -112,7 +114,9 @@ class Case:
 
     @property
     def price_text(self) -> str:
-        """What a change of the share costs strategy `preview`."""
+        """What a change of the share costs strategy `preview`, or how many it may make."""
+        if self.changes_per_min > 0.0:
+            return f"at most {self.changes_per_min:g} changes a minute"
         fixed = f" + {self.switching_fixed_cost_j:g} J for any change" if self.switching_fixed_cost_j else ""
         return f"{self.switching_cost_j:g} J a move{fixed}"
 
@@ -211,7 +215,7 @@ def _policy_table(case: Case, vehicle: Vehicle, until_s: float) -> PolicyTable:
 
 
 def known_in_advance(case: Case, vehicle: Vehicle, until_s: float = np.inf) -> tuple[Run, FloatArray]:
-    """A drive of the cycle with equal split, and the best schedule for the demand it had (`preview.schedule`)."""
+    """A drive of the cycle with equal split, and the best schedule for the demand it had (`preview`)."""
     equal = closed_loop.run(
         cycle_of(case.cycle),
         vehicle,
@@ -224,23 +228,27 @@ def known_in_advance(case: Case, vehicle: Vehicle, until_s: float = np.inf) -> t
         soc=case.soc,
         until_s=until_s,
     )
-    schedule = preview.schedule(
+    share = empty_table().share
+    cost = preview.step_costs(
         equal["power_demand_w"],
         equal["speed_mps"],
         case.dt_s,
         case.settings.decision_period_s,
         vehicle.params,
         case.told_friction,
-        empty_table().share,
-        case.switching_cost_j,
-        case.switching_fixed_cost_j,
+        share,
     )
-    return equal, schedule
+    if case.changes_per_min > 0.0:
+        most = case.changes_per_min * equal.series.shape[0] * equal.dt_s / 60.0
+        return equal, preview.cheapest_within(cost, share, most)
+    return equal, preview.cheapest_schedule(cost, share, case.switching_cost_j, case.switching_fixed_cost_j)
 
 
 def priced_as(case: Case, policy: str) -> Case:
-    """A case whose changes of the share have the price they have in a policy."""
+    """A case with a policy's budget of changes; without one, with its prices of a change."""
     problem = policy_of(policy).problem
+    if problem.changes_per_min > 0.0:
+        return dataclasses.replace(case, changes_per_min=problem.changes_per_min)
     return dataclasses.replace(
         case, switching_cost_j=problem.switching_cost_j, switching_fixed_cost_j=problem.switching_fixed_cost_j
     )

@@ -45,7 +45,6 @@ COUNTS = ("changes_per_min", "fine_changes_per_min", "travel_per_min")
 FINE_CHANGE = 0.05
 
 _DT_S = 0.01
-_BISECTIONS = 12
 
 
 class Place(NamedTuple):
@@ -197,16 +196,9 @@ def _bound(place: Place, reference: _Reference, ours: Run, others: Sequence[Poin
 
 def _schedule(place: Place, run: Run, changes_per_min: float) -> FloatArray:
     """The cheapest schedule for the demand of a run with at most so many changes a minute."""
-    most = changes_per_min * run.series.shape[0] * run.dt_s / 60.0 + 1e-6
+    most = changes_per_min * run.series.shape[0] * run.dt_s / 60.0
     period = default_settings().decision_period_s
     demand, speed = run["power_demand_w"], run["speed_mps"]
     share = empty_table().share
     cost = preview.step_costs(demand, speed, run.dt_s, period, place.vehicle.params, place.friction, share)
-    low, high = 1e-2, 1e6
-    for _ in range(_BISECTIONS):
-        price = float(np.sqrt(low * high))
-        if share_changes(preview.cheapest_schedule(cost, share, price)) > most:
-            low = price
-        else:
-            high = price
-    return preview.cheapest_schedule(cost, share, high)
+    return preview.cheapest_within(cost, share, most)

@@ -42,7 +42,8 @@ class Row:
     strategy : name in `STRATEGIES`
     metrics : what was measured
     saving_percent : energy saved against equal split of the same drive; None where the distances differ
-    share_of_possible : the saving as a part of `preview`'s, where that was driven and there is anything to save
+    share_of_possible : the saving as a part of the most that `preview` or another strategy saves with no more changes
+        than `preview` may make, where that was driven and there is anything to save
     same_distance_as_equal : None without equal split to compare with
     made_with : settings, hashes and whatever else the numbers depend on, as plain values
     """
@@ -116,14 +117,31 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
     Results belong together if they differ in nothing but strategy, label, policy and law settings.
     """
     references: dict[tuple[Any, ...], Metrics] = {}
-    bounds: dict[tuple[Any, ...], Metrics] = {}
+    bounds: dict[tuple[Any, ...], Result] = {}
     for made in results:
         group = _group(made.case)
         if made.case.strategy == REFERENCE:
             references.setdefault(group, made.metrics)
         if made.case.strategy == "preview":
-            bounds.setdefault(group, made.metrics)
-    return [_row(made, references.get(_group(made.case)), bounds.get(_group(made.case))) for made in results]
+            bounds.setdefault(group, made)
+    possible = {
+        group: _possible(bound, [made for made in results if _group(made.case) == group], references.get(group))
+        for group, bound in bounds.items()
+    }
+    return [_row(made, references.get(_group(made.case)), possible.get(_group(made.case))) for made in results]
+
+
+def _possible(bound: Result, others: Sequence[Result], reference: Metrics | None) -> float | None:
+    """The most that is saved with no more changes than `preview` may make, %.
+
+    What another strategy did could have been known in advance as well.
+    """
+    if reference is None:
+        return None
+    most = max(bound.case.changes_per_min, bound.metrics.share_changes_per_min) + 1e-9
+    within = [made for made in others if made is bound or made.metrics.share_changes_per_min <= most]
+    savings = [saving_percent(made.metrics, reference) for made in within]
+    return max((saving for saving in savings if saving is not None), default=None)
 
 
 def _group(case: Case) -> tuple[Any, ...]:
@@ -133,10 +151,9 @@ def _group(case: Case) -> tuple[Any, ...]:
     )
 
 
-def _row(made: Result, reference: Metrics | None, bound: Metrics | None) -> Row:
+def _row(made: Result, reference: Metrics | None, possible: float | None) -> Row:
     case = made.case
     saving = saving_percent(made.metrics, reference) if reference else None
-    possible = saving_percent(bound, reference) if reference and bound else None
     worth = saving is not None and possible is not None and possible > _LEAST_POSSIBLE_PERCENT
     return Row(
         place=Place(
@@ -166,6 +183,7 @@ def _made_with(case: Case) -> dict[str, Any]:
         "preview_switching_cost_j": (
             [case.switching_cost_j, case.switching_fixed_cost_j] if case.strategy == "preview" else None
         ),
+        "preview_changes_per_min": case.changes_per_min or None,
         "vehicle": vehicle.name,
         "vehicle_hash": vehicle.hash,
         "cycle_sha256": cycle_of(case.cycle).sha256,

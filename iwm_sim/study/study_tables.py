@@ -174,7 +174,7 @@ def paper_tables(rows: Sequence[Row], cycles: Sequence[str]) -> Iterator[TableOf
                 columns,
                 [by_cell[place] for place in places if place in by_cell],
                 "Left as printed, right as driven here. Savings are against ED of the same table. Possible: preview of "
-                "the whole cycle, with changes of the split at our policy's price.",
+                "the whole cycle with at most our budget of changes a minute.",
                 f"evaluate --paper {paper.TABLES[friction]}",
             )
 
@@ -287,7 +287,7 @@ def ablation_table(study: Study) -> TableOf:
 
 
 #: The bounds, and what their changes cost.
-_BOUNDS = {BOUND: "priced", FREE_BOUND: "free"}
+_BOUNDS = {BOUND: "budget", FREE_BOUND: "free"}
 
 
 def _percent(part: float | None) -> float | None:

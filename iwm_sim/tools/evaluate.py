@@ -83,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
     result = described("evaluate", _DESCRIPTION, _EXAMPLES, abbreviated=False)
     _add_cases(result.add_argument_group("cases (all combinations are driven)"))
-    _add_policies(result.add_argument_group("policies (sdp, sdp_lookahead; preview takes its price from them)"))
+    _add_policies(result.add_argument_group("policies (sdp, sdp_lookahead; preview takes its budget from them)"))
     _add_law(result.add_argument_group("control law"))
     _add_simulation(result.add_argument_group("simulation"))
     _add_output(result.add_argument_group("output"))
@@ -142,7 +142,7 @@ def _add_law(group: argparse._ArgumentGroup) -> None:
         "--switching-cost",
         type=number(0.0, 1e6),
         metavar="J",
-        help="preview: price of moving all the power to the other axle (default: that of the policy in use)",
+        help="preview: price of moving all the power to the other axle (default: what keeps the policy's budget)",
     )
     group.add_argument(
         "--assumed-friction",

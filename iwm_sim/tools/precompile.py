@@ -62,7 +62,8 @@ def jobs() -> Iterator[Job]:
     def schedule_known_ahead() -> None:
         run = closed_loop_run()
         share = table.share
-        preview.schedule(run["power_demand_w"], run["speed_mps"], 0.01, 0.1, vehicle.params, 0.9, share)
+        cost = preview.step_costs(run["power_demand_w"], run["speed_mps"], 0.01, 0.1, vehicle.params, 0.9, share)
+        preview.cheapest_schedule(cost, share)
 
     def solver() -> None:
         problem = problem_from(_smallest_grid(), "precompile")

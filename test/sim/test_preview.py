@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
-from iwm_sim.preview import cheapest_path, fit_rule, schedule
+from iwm_sim.metrics import share_changes
+from iwm_sim.preview import cheapest_path, cheapest_schedule, cheapest_within, fit_rule, step_costs
 from oracles.splits import MISSING_PRICE, split_w
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), "none").params
@@ -77,6 +78,24 @@ def test_without_switching_costs_each_decision_is_the_cheapest_of_its_steps(fric
     for k, share in enumerate(chosen):
         costs = decision_cost(2 * k, min(2 * k + 2, 7), 0.1, friction)
         assert costs[list(SHARE).index(share)] == pytest.approx(costs.min(), rel=1e-6, abs=1e-3)
+
+
+def schedule(power_w, speed_mps, dt_s, period_s, vehicle, friction, share, **prices):
+    cost = step_costs(power_w, speed_mps, dt_s, period_s, vehicle, friction, share)
+    return cheapest_schedule(cost, share, **prices)
+
+
+def test_a_number_of_changes_is_kept_and_more_of_them_never_cost_more():
+    cost = step_costs(POWER, SPEED, 0.1, 0.1, CAR, 0.9, SHARE)
+
+    def total(chosen):
+        return sum(cost[k, np.flatnonzero(u == SHARE)[0]] for k, u in enumerate(chosen))
+
+    free = share_changes(cheapest_schedule(cost, SHARE))
+    assert free == 3
+    found = [cheapest_within(cost, SHARE, most) for most in (0, 2, free)]
+    assert [share_changes(chosen) <= most for chosen, most in zip(found, (0, 2, free), strict=True)] == [True] * 3
+    assert total(found[0]) >= total(found[1]) > total(found[2])
 
 
 def test_switching_costs_hold_the_share():
