@@ -2,7 +2,8 @@
 """Seconds from nothing to the first command: the control law's first step from an empty and from a full kernel cache.
 
 Each run is a process of its own: import, vehicle, policy, first step. `--peer FOLDER` runs another checkout beside it,
-in turns, so that both see the same machine.
+in turns, so that both see the same machine. Of this checkout alone it also times every command's `--help`, and the node
+until it is active with a full cache.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from importlib import metadata
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,7 +49,7 @@ print(law.__file__)
 
 def first_command_s(checkout: Path, cache: Path) -> tuple[float, float]:
     """Seconds on the clock and of the processor until the law has answered once."""
-    environment = {**os.environ, "PYTHONPATH": str(checkout), "IWM_CACHE_DIR": str(cache)}
+    environment = environment_of(checkout, cache)
     started, used = time.perf_counter(), os.times()
     command = [sys.executable, "-P", "-c", FIRST_STEP]
     done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
@@ -54,6 +57,91 @@ def first_command_s(checkout: Path, cache: Path) -> tuple[float, float]:
         raise SystemExit(f"{checkout} was not what ran: {done.stdout.strip()}")
     passed, after = time.perf_counter() - started, os.times()
     return passed, after.children_user + after.children_system - used.children_user - used.children_system
+
+
+def environment_of(checkout: Path, cache: Path) -> dict[str, str]:
+    """What a process needs to run a checkout's code with a kernel cache of its own, heard by nobody else."""
+    return {
+        **os.environ,
+        "PYTHONPATH": str(checkout),
+        "IWM_CACHE_DIR": str(cache),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(cache / "log"),
+        "PYTHONUNBUFFERED": "1",
+    }
+
+
+def help_s(target: str, cache: Path) -> tuple[float, float]:
+    """Seconds of a command's `--help`, on the clock and of the processor."""
+    module, function = target.split(":")
+    code = f"import sys; from {module} import {function}; sys.argv = ['{function}', '--help']; {function}()"
+    started, used = time.perf_counter(), os.times()
+    subprocess.run([sys.executable, "-c", code], env=environment_of(ROOT, cache), check=True, capture_output=True)
+    passed, after = time.perf_counter() - started, os.times()
+    return passed, after.children_user + after.children_system - used.children_user - used.children_system
+
+
+def active_s(cache: Path) -> tuple[float, float]:
+    """Seconds until the node's first control step is heard, on the clock and of the processor (to its end)."""
+    import rclpy
+    from sensor_msgs.msg import JointState
+
+    from iwm_sim.domains import claimed_domain
+
+    heard: list[JointState] = []
+    with claimed_domain() as domain:
+        context = rclpy.Context()
+        rclpy.init(context=context, domain_id=domain, args=[])
+        listener = rclpy.create_node("cold_start", context=context)
+        listener.create_subscription(JointState, "power_manager/state", heard.append, 10)
+        executor = rclpy.executors.SingleThreadedExecutor(context=context)
+        executor.add_node(listener)
+        environment = environment_of(ROOT, cache) | {"ROS_DOMAIN_ID": str(domain)}
+        started, used = time.perf_counter(), os.times()
+        with subprocess.Popen(
+            [sys.executable, "-m", "iwm_power_manager.nodes.power_manager"],
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        ) as node:
+            while not heard and node.poll() is None:
+                executor.spin_once(timeout_sec=0.01)
+            passed = time.perf_counter() - started
+            node.send_signal(signal.SIGINT)
+        executor.shutdown()
+        listener.destroy_node()
+        rclpy.shutdown(context=context)
+    if not heard:
+        raise SystemExit("the node ended before its first step")
+    after = os.times()
+    return passed, after.children_user + after.children_system - used.children_user - used.children_system
+
+
+def median_line(name: str, measured: list[tuple[float, float]], what: str) -> str:
+    """One line: median, extremes and processor time."""
+    clock = [wall for wall, _ in measured]
+    processor = statistics.median(cpu for _, cpu in measured)
+    return (
+        f"{name}: {statistics.median(clock):6.2f} s {what} ({min(clock):.2f} to {max(clock):.2f}), "
+        f"{processor:.2f} s of the processor"
+    )
+
+
+def started_programs(repeat: int) -> dict[str, list[tuple[float, float]]]:
+    """Times of each `--help`, and of the node with a full cache."""
+    commands = {
+        entry.name: entry.value
+        for entry in metadata.distribution("iwm_power_manager").entry_points
+        if entry.group == "console_scripts"
+    }
+    times: dict[str, list[tuple[float, float]]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        cache = Path(folder)
+        for name, target in sorted(commands.items()):
+            times[f"{name} --help"] = [help_s(target, cache) for _ in range(repeat)]
+        active_s(cache)  # fills the cache
+        times["power_manager"] = [active_s(cache) for _ in range(repeat)]
+    return times
 
 
 def main() -> None:
@@ -72,14 +160,12 @@ def main() -> None:
                 times[name]["warm"].append(first_command_s(checkout, Path(cache)))
     for name, kinds in times.items():
         for kind, measured in kinds.items():
-            clock = [wall for wall, _ in measured]
-            processor = statistics.median(cpu for _, cpu in measured)
-            print(
-                f"{name:5} {kind}: {statistics.median(clock):6.2f} s to the first command "
-                f"({min(clock):.2f} to {max(clock):.2f}), {processor:.2f} s of the processor"
-            )
+            print(median_line(f"{name:5} {kind}", measured, "to the first command"))
+    programs = started_programs(options.repeat)
+    for name, measured in programs.items():
+        print(median_line(f"{name:22}", measured, "until its first step" if name == "power_manager" else ""))
     if options.json:
-        Path(options.json).write_text(json.dumps(times, indent=2) + "\n")
+        Path(options.json).write_text(json.dumps(times | programs, indent=2) + "\n")
 
 
 if __name__ == "__main__":
