@@ -20,6 +20,7 @@ NAME = str(MANIFEST.findtext("name"))
 EXECUTABLES = {
     "demo": "iwm_sim.executables:demo",
     "evaluate": "iwm_sim.executables:evaluate",
+    "fleet": "iwm_sim.executables:fleet",
     "import_cycle": "iwm_power_manager.executables:import_cycle",
     "import_motor": "iwm_power_manager.executables:import_motor",
     "learn_policy": "iwm_sim.executables:learn_policy",
@@ -100,6 +101,8 @@ setup(
         "test": ["pytest"],
         # A DataFrame of a drive (`iwm_sim.api`).
         "frame": ["pandas"],
+        # Studies on all cores or a cluster (`fleet`).
+        "fleet": ["distributed", "pyarrow"],
         # The page of `watch_car`.
         "watch": ["bokeh"],
     },

@@ -45,6 +45,10 @@ class ConfigError(IwmError):
         shown = one_line(problem, _MAX_PROBLEM)
         super().__init__(f"{where}: {shown}" + (f"; allowed: {allowed}" if allowed else ""))
 
+    def __reduce__(self) -> tuple[type[ConfigError], tuple[str, str, str, str]]:
+        """Come out of a worker process as it was raised there."""
+        return type(self), (self.file, self.key, self.problem, self.allowed)
+
 
 class PolicyError(IwmError):
     """A policy file is missing, damaged, foreign, or was solved for another car."""

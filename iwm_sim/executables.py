@@ -9,6 +9,7 @@ from iwm_power_manager.executables import INTERRUPTED, NODE_ENDED, run
 
 demo = partial(run, "iwm_sim.tools.demo", INTERRUPTED)
 evaluate = partial(run, "iwm_sim.tools.evaluate", INTERRUPTED)
+fleet = partial(run, "iwm_sim.tools.fleet", INTERRUPTED)
 learn_policy = partial(run, "iwm_sim.tools.learn", INTERRUPTED)
 precompile = partial(run, "iwm_sim.tools.precompile", INTERRUPTED)
 simulator = partial(run, "iwm_sim.simulator", NODE_ENDED)

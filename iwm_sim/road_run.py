@@ -134,17 +134,20 @@ def drive_scenario(
     return drive.run()
 
 
-def check_scenario(scenario: Scenario, settings: Settings | None = None) -> RoadResult:
+def check_scenario(scenario: Scenario, settings: Settings | None = None, policies: str = "policies") -> RoadResult:
     """Drive a scenario and compare what comes out with what it requires."""
-    return checked_run(scenario, drive_scenario(scenario, controller_of(scenario, settings)), settings)
+    run = drive_scenario(scenario, controller_of(scenario, settings, policies))
+    return checked_run(scenario, run, settings, policies)
 
 
-def checked_run(scenario: Scenario, run: Run, settings: Settings | None = None) -> RoadResult:
+def checked_run(
+    scenario: Scenario, run: Run, settings: Settings | None = None, policies: str = "policies"
+) -> RoadResult:
     """Compare a run of a scenario, wherever it was driven, with what the scenario requires."""
     names = [bound.measure for bound in scenario.require]
     healthy = None
     if not OF_HEALTHY.keys().isdisjoint(names):
         whole = dataclasses.replace(scenario, faults=())
-        healthy = driven(drive_scenario(whole, controller_of(whole, settings)), scenario.truth)
+        healthy = driven(drive_scenario(whole, controller_of(whole, settings, policies)), scenario.truth)
     values = measured(names, driven(run, scenario.truth), healthy)
     return RoadResult(scenario, run, tuple(Checked(bound, values[bound.measure]) for bound in scenario.require))

@@ -153,13 +153,14 @@ def on_cycle(vehicle: Vehicle, cycle: Cycle, friction: float, soc: float = 0.8, 
     )
 
 
-def load_scenario(name: Path | str, idle_drive: str | None = None) -> Scenario:
+def load_scenario(name: Path | str, idle_drive: str | None = None, vehicle: Vehicle | None = None) -> Scenario:
     """Read and check a scenario.
 
     Parameters
     ----------
     name : file, or name of one of the package's scenarios
     idle_drive : replaces the vehicle's
+    vehicle : drives it instead of the scenario's own
 
     Raises
     ------
@@ -171,7 +172,8 @@ def load_scenario(name: Path | str, idle_drive: str | None = None) -> Scenario:
     files.check_keys(path, content, ("format", "about", "road"), _KEYS)
     if content["format"] != FORMAT:
         raise ConfigError(path, "format", f"{content['format']!r} is unknown", str(FORMAT))
-    vehicle = load_vehicle(_file(path, "vehicle", content.get("vehicle", DEFAULT_VEHICLE)), idle_drive)
+    named = content.get("vehicle", DEFAULT_VEHICLE)
+    vehicle = vehicle or load_vehicle(_file(path, "vehicle", named), idle_drive)
     if ("cycle" in content) == ("demand" in content):
         raise ConfigError(path, "", "needs exactly one of cycle, demand", "cycle | demand")
     cycle = load_cycle(_file(path, "cycle", content["cycle"])) if "cycle" in content else None

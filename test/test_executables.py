@@ -17,7 +17,7 @@ from iwm_sim import executables as sim_executables
 ROOT = Path(__file__).resolve().parents[1]
 NODES = ["power_manager", "recorder", "simulator"]
 COMMANDS = [
-    "demo", "evaluate", "import_cycle", "import_motor", "learn_policy", "precompile", "replay", "solve_policy",
+    "demo", "evaluate", "fleet", "import_cycle", "import_motor", "learn_policy", "precompile", "replay", "solve_policy",
 ]  # fmt: skip
 
 #: Stands in for a library whose import takes long.

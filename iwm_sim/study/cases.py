@@ -31,6 +31,7 @@ from iwm_power_manager.vehicle import Vehicle, load_vehicle, with_params
 from iwm_sim import closed_loop, preview
 from iwm_sim.closed_loop import Noise, Run
 from iwm_sim.metrics import Metrics, measure
+from iwm_sim.study import generate
 from iwm_sim.study.names import REFERENCE
 
 FloatArray = npt.NDArray[np.float64]
@@ -40,6 +41,9 @@ POLICY_STRATEGIES = frozenset(name for name, known in STRATEGIES.items() if know
 
 #: The cycle the generalized rule is fitted to, as in the paper.
 RULE_CYCLE = "config/cycles/ftp75.csv"
+
+#: The car that drawn ones are drawn around.
+BASE_CAR = "config/vehicles/jalalmaab_2015.yaml"
 
 
 class SensorNoise(NamedTuple):
@@ -134,17 +138,32 @@ class Result(NamedTuple):
     series: dict[str, FloatArray]
 
 
+def drawn_seed(name: str) -> int | None:
+    """Seed of a car or cycle that is drawn (`generated:1000`) and stands in no file; None for a file."""
+    kind, _, seed = name.partition(":")
+    return int(seed) if kind == "generated" and seed.isdecimal() else None
+
+
 @functools.lru_cache(maxsize=16)
 def cycle_of(path: str) -> Cycle:
-    """A cycle by file or short name."""
-    return load_cycle(resolve(path))
+    """A cycle by file or short name, or drawn: `generated:SEED`."""
+    seed = drawn_seed(path)
+    return load_cycle(resolve(path)) if seed is None else generate.cycle(seed)
 
 
 @functools.lru_cache(maxsize=16)
 def vehicle_of(path: str, idle_drive: str, changes: tuple[Change, ...] = ()) -> Vehicle:
-    """A car by file or short name, with some of its numbers changed."""
-    vehicle = load_vehicle(resolve(path), idle_drive or None)
+    """A car by file or short name, or drawn (`generated:SEED`), with some of its numbers changed."""
+    seed = drawn_seed(path)
+    vehicle = load_vehicle(resolve(path), idle_drive or None) if seed is None else drawn_car(seed, BASE_CAR, idle_drive)
     return with_params(vehicle, vehicle.name, changed(vehicle.params, changes)) if changes else vehicle
+
+
+def drawn_car(seed: int, base: str, idle_drive: str) -> Vehicle:
+    """A car that nobody chose, around another one; a third of them has the package's motor map, scaled."""
+    around = load_vehicle(resolve(base), idle_drive or None)
+    mapped = load_vehicle(resolve("jalalmaab_2015_map")).params.front.motor
+    return generate.car(seed, around, mapped._replace(idle_drive=around.params.front.motor.idle_drive))
 
 
 @functools.lru_cache(maxsize=16)

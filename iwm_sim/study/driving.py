@@ -108,22 +108,27 @@ def drive_all(
     drive: Callable[[Case], Result] = cases.result,
 ) -> list[Result]:
     """Results of the cases, in their order; driven longest first, for the cores to finish together."""
-    order = sorted(range(len(wanted)), key=lambda index: -_effort(wanted[index]))
+    order = sorted(range(len(wanted)), key=lambda index: -effort(wanted[index]))
     made = on_all_cores(drive, [wanted[index] for index in order], jobs, done)
     return [result for _, result in sorted(zip(order, made, strict=True), key=lambda pair: pair[0])]
 
 
-def _effort(case: Case) -> float:
-    """How long a case takes beside others."""
+def effort(case: Case) -> float:
+    """How long a case takes beside others: plant steps, times what its strategy takes beside equal split."""
     steps = cases.cycle_of(case.cycle).duration_s / case.dt_s * case.substeps
     return steps * _WEIGHTS.get(case.strategy, _HIGHEST_WEIGHT)
+
+
+def progress_of(total: int, unit: str, quiet: bool) -> tqdm[Any]:
+    """A bar on stderr that is gone when it is done."""
+    return tqdm(total=total, unit=unit, file=sys.stderr, disable=quiet, leave=False)
 
 
 class Progress:
     """A bar over cases."""
 
     def __init__(self, total: int, quiet: bool) -> None:
-        self._bar = tqdm(total=total, unit="case", file=sys.stderr, disable=quiet, leave=False)
+        self._bar = progress_of(total, "case", quiet)
 
     def __enter__(self) -> Progress:
         return self

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -98,6 +99,7 @@ def solved(
     say: Callable[[str], None] = lambda _: None,
     because: str = "",
     cycles: Sequence[str] = TRAINING_CYCLES,
+    budget_per_min: float | None = None,
 ) -> str:
     """A policy for a car (as its file has it) and a road, from the user's cache, or solved now.
 
@@ -108,6 +110,7 @@ def solved(
     say : told in one line if it is solved
     because : why it is needed, for that line
     cycles : it learns its demand from
+    budget_per_min : changes of the split a minute; None is the grid's own
 
     Returns
     -------
@@ -121,6 +124,8 @@ def solved(
     grid_file = grid_path(grid)
     solver = sources_hash("iwm_power_manager.solve")
     digest = hashlib.sha256(f"{vehicle.hash} {friction!r} {solver}".encode())
+    if budget_per_min is not None:
+        digest.update(f"{budget_per_min!r} a minute".encode())
     for file in (grid_file, *map(resolve, cycles)):
         digest.update(read_bytes(file))
     folder = cache_folder() / "policies"
@@ -130,6 +135,8 @@ def solved(
         say(f"{because}; {what}" if because else what)
         folder.mkdir(parents=True, exist_ok=True)
         problem = load_problem(grid_file).for_car(vehicle.params)
+        if budget_per_min is not None:
+            problem = dataclasses.replace(problem, changes_per_min=budget_per_min)
         sources = [source_of(load_cycle(resolve(cycle)), problem, vehicle.params) for cycle in cycles]
         solve_one(problem, vehicle, friction, chain_of(problem, sources), sources, file)
     return str(file)

@@ -21,8 +21,9 @@ from iwm_power_manager.mdp.demand import chain_of, source_of
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import load_grid, solve_one
-from iwm_power_manager.vehicle import Vehicle, load_vehicle
+from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.study import generate
+from iwm_sim.study.cases import drawn_car, vehicle_of
 from iwm_sim.study.frontier import COUNTS, Frontier, Place, margin, measure_frontier
 from iwm_sim.study.names import DEFAULT_GRID
 from iwm_sim.study.policies import TRAINING_CYCLES, PolicySource
@@ -70,11 +71,9 @@ def cells(vehicle: str, idle_drive: str, first_seed: int, cycles: int, cars: int
 
 def car_of(cell: Cell) -> Vehicle:
     """The car of a cell."""
-    base = load_vehicle(resolve(cell.vehicle), cell.idle_drive or None)
     if cell.car < 0:
-        return base
-    mapped = load_vehicle(resolve("jalalmaab_2015_map")).params.front.motor
-    return generate.car(cell.car, base, mapped._replace(idle_drive=base.params.front.motor.idle_drive))
+        return vehicle_of(cell.vehicle, cell.idle_drive)
+    return drawn_car(cell.car, cell.vehicle, cell.idle_drive)
 
 
 def place_of(cell: Cell) -> Place:

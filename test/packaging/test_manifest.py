@@ -44,7 +44,7 @@ ROSDEP_KEYS = {
     "zstandard": "python3-rosbags-pip",
 }
 #: Used where they are installed; without them, one line says what to install.
-OPTIONAL = {"pandas"}
+OPTIONAL = {"dask", "distributed", "pandas", "pyarrow"}
 #: What pip calls a module of another name.
 DISTRIBUTIONS = {"yaml": "pyyaml"}
 
