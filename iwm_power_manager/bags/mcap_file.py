@@ -144,24 +144,23 @@ class McapFile:
         self._buffer.write(record)
         self.push()
 
-    def flush(self, sync: bool = False) -> None:
-        """Write the chunk in memory, if it holds a message; with `sync` wait until the disk has it."""
+    def flush(self) -> None:
+        """Write the chunk in memory, if it holds a message."""
         self.writer.flush()
         self.push()
-        if sync:
-            os.fdatasync(self._stream.fileno())
 
     def duplicate_descriptor(self) -> int:
         """A descriptor of the open file that stays valid when this one is closed."""
         return os.dup(self._stream.fileno())
 
-    def finish(self) -> None:
-        """Write the last chunk and the index, and close the file."""
+    def finish(self, sync: bool = True) -> None:
+        """Write the last chunk and the index, with `sync` wait until the disk has them, and close the file."""
         try:
             self.flush()
             self.writer.finish()
             self.push()
-            os.fsync(self._stream.fileno())
+            if sync:
+                os.fsync(self._stream.fileno())
         finally:
             self._stream.close()
 

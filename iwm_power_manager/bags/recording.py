@@ -8,7 +8,6 @@ topic, start, stop, split, snapshot) goes through the same queue, in order with 
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import deque
@@ -117,7 +116,6 @@ class Recording:
         self._memory_bytes = 0
         self._next_flush = time.monotonic()
         self._disk = ThreadPoolExecutor(1, "disk")
-        self._syncing: Future[None] | None = None
         self._on_disk_until: float | None = None  # what was given before is on the disk; None while nothing is written
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
@@ -286,21 +284,14 @@ class Recording:
 
         What is in the file survives the recorder, and a slow disk must not keep the next data from getting there.
         """
-        self._next_flush = time.monotonic() + self.options.flush_period_s
+        now = time.monotonic()
+        self._next_flush = now + self.options.flush_period_s
         writer.flush()
-        if not self.options.sync or (self._syncing is not None and not self._syncing.done()):
-            return
-        error = self._syncing.exception() if self._syncing is not None else None
-        if error is not None:
-            raise WriteFailed(f"{writer.path}: the disk reports an error: {error}")
-        self._syncing = self._disk.submit(self._sync, writer.duplicate_descriptor(), time.monotonic())
+        if self.options.sync:
+            writer.sync(lambda: self._reached(now))
 
-    def _sync(self, descriptor: int, until: float) -> None:
-        """Run by the disk's thread: what was in the file at `until` is on the disk afterwards."""
-        try:
-            os.fdatasync(descriptor)
-        finally:
-            os.close(descriptor)
+    def _reached(self, until: float) -> None:
+        """What was in the file at `until` is on the disk (said by the disk's thread)."""
         with self._wake:
             if self._on_disk_until is not None:
                 self._on_disk_until = max(self._on_disk_until, until)
@@ -315,7 +306,6 @@ class Recording:
             self._leave(writer)
         self._error = str(error) if isinstance(error, BagError) else f"internal error: {error!r}"
         self._state = FAILED
-        self._syncing = None
         self.failed.set()
 
     def _leave(self, writer: BagWriter) -> None:
@@ -337,7 +327,7 @@ class Recording:
             self._writer.set_custom_data(values)
 
     def _new_bag(self, path: Path) -> BagWriter:
-        writer = BagWriter(path, self.options.writer, self._custom_data)
+        writer = BagWriter(path, self.options.writer, self._custom_data, self._disk)
         for topic in self._announced:
             writer.add_topic(topic)
         return writer

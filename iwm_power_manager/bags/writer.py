@@ -8,9 +8,12 @@ each file carries every schema and the custom metadata, so that each can be read
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -80,6 +83,7 @@ class BagWriter:
     path : folder to create; an existing one is never touched
     options : compression, splits and limits
     custom_data : free text by key, for `custom_data` of the metadata
+    disk : waits for the disk in the place of the writing methods, which go on meanwhile; None: they wait
 
     Raises
     ------
@@ -90,10 +94,16 @@ class BagWriter:
     """
 
     def __init__(
-        self, path: Path | str, options: WriterOptions | None = None, custom_data: Mapping[str, str] | None = None
+        self,
+        path: Path | str,
+        options: WriterOptions | None = None,
+        custom_data: Mapping[str, str] | None = None,
+        disk: Executor | None = None,
     ) -> None:
         self.path = Path(path)
         self.options = options or WriterOptions()
+        self._disk = disk
+        self._disk_work: deque[Future[None]] = deque()
         self.custom_data = dict(custom_data or {})
         self._topics: list[Topic] = []
         self._counts: list[int] = []
@@ -193,14 +203,28 @@ class BagWriter:
         if self._file_start_ns is None:
             self._file_start_ns = log_time_ns
 
-    def flush(self, sync: bool = False) -> None:
-        """Bring everything given so far into the file; with `sync` onto the disk."""
+    def flush(self) -> None:
+        """Bring everything given so far into the file: it then survives this process."""
         with self._failing():
-            self._open.flush(sync)
+            self._open.flush()
 
-    def duplicate_descriptor(self) -> int:
-        """A descriptor of the current file, for whoever wants to wait for the disk; theirs to close."""
-        return self._open.duplicate_descriptor()
+    def sync(self, then: Callable[[], object]) -> None:
+        """Have the disk take what is in the file, and call `then`; nothing is done while it is at earlier work."""
+        with self._failing():
+            self._check_disk()
+            if not self._disk_work:
+                self._on_disk(partial(_take, self._open.duplicate_descriptor(), then))
+
+    def _on_disk(self, work: Callable[[], None]) -> None:
+        if self._disk is None:
+            work()
+        else:
+            self._disk_work.append(self._disk.submit(work))
+
+    def _check_disk(self, wait: bool = False) -> None:
+        """Raise what the disk has said to earlier work."""
+        while self._disk_work and (wait or self._disk_work[0].done()):
+            self._disk_work.popleft().result()
 
     def split(self) -> None:
         """Close the current file and begin the next."""
@@ -216,6 +240,8 @@ class BagWriter:
         try:
             if self._file is not None:
                 self._finish_file(self._file)
+            with self._failing():
+                self._check_disk(wait=True)
         finally:
             topics = list(zip(self._topics, self._counts, strict=True))
             write_metadata(self.path, self._spans, topics, self.custom_data)
@@ -251,7 +277,7 @@ class BagWriter:
                 chunk_bytes=self.options.chunk_bytes,
             )
             try:
-                sync_folder(self.path)
+                self._on_disk(partial(sync_folder, self.path))
                 if self.custom_data:
                     file.writer.add_metadata(CUSTOM_METADATA, self.custom_data)
                 self._channels = [announce(file, topic) for topic in self._topics]
@@ -269,6 +295,7 @@ class BagWriter:
                     file.abandon()
                 else:
                     finish(file, list(zip(self._topics, self._channels, strict=True)), self.custom_data)
+                    self._on_disk(partial(_take, os.open(file.path, os.O_RDONLY)))
         finally:
             file.abandon()
             self._file = self._file_start_ns = None
@@ -276,6 +303,15 @@ class BagWriter:
                 self._counts[index] += file.counts[channel]
             self._spans.append(span_of(file))
             self._closed_bytes += file.size_bytes
+
+
+def _take(descriptor: int, then: Callable[[], object] = lambda: None) -> None:
+    """Wait until the disk has what is in a file, and close the descriptor."""
+    try:
+        os.fdatasync(descriptor)
+    finally:
+        os.close(descriptor)
+    then()
 
 
 def _make_folder(path: Path) -> None:
@@ -299,12 +335,12 @@ def announce(file: McapFile, topic: Topic) -> int:
 
 
 def finish(file: McapFile, channels: Sequence[tuple[Topic, int]], custom_data: Mapping[str, str]) -> None:
-    """Complete a file with the metadata rosbag2 keeps inside, and close it."""
+    """Complete a file with the metadata rosbag2 keeps inside, and close it; the disk may still have to take it."""
     file.flush()
     counts = [(topic, file.counts[channel]) for topic, channel in channels]
     information = bag_information("mcap", [span_of(file)], counts, custom_data)
     file.writer.add_metadata("rosbag2", {"serialized_metadata": yaml_text(information)})
-    file.finish()
+    file.finish(sync=False)
 
 
 def span_of(file: McapFile) -> FileSpan:

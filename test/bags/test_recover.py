@@ -7,6 +7,7 @@ import io
 import os
 import random
 import signal
+import struct
 import subprocess
 import sys
 import tempfile
@@ -28,9 +29,10 @@ from iwm_power_manager.errors import BagError
 
 COUNT = 400
 
-#: Records one message a millisecond, its log time the machine's monotonic clock; says "recording" once it does.
+#: Records one message a millisecond, its log time the machine's monotonic clock; says "recording" once it does. When it
+#: has given which message, it notes in a file beside the bag that survives it.
 CHILD = """
-import sys, time
+import mmap, struct, sys, time
 from bags_helpers import float64, topic
 from iwm_power_manager.bags.recording import Recording, RecordingOptions
 from iwm_power_manager.bags.writer import WriterOptions
@@ -40,12 +42,18 @@ recording = Recording(
 )
 recording.start()
 number = recording.add_topic(topic("/a"))
+with open(path + ".given", "w+b") as file:
+    file.truncate(8 * 100_000)
+    given = mmap.mmap(file.fileno(), 0)
 print("recording", flush=True)
 start = time.monotonic()
 count = 0
 while True:
     due = int((time.monotonic() - start) * 1000)
-    recording.put([(number, time.monotonic_ns(), float64(i), i, i + 1) for i in range(count, due)])
+    now = time.monotonic_ns()
+    recording.put([(number, now, float64(i), i, i + 1) for i in range(count, due)])
+    for i in range(count, due):
+        struct.pack_into("<q", given, 8 * i, now)
     count = due
     time.sleep(0.005)
 """
@@ -267,11 +275,10 @@ def kill_campaign(folder: Path, runs: int, at_once: int) -> float:
             report = recover(path)
             numbers = publish_times(path) if report.files[0].message_count else []
             assert numbers == list(range(len(numbers))), path
-            if not numbers:
-                assert delay < 1.0, path
-                continue
-            assert killed_ns - report.end_ns < 1_000_000_000, path
-            largest_s = max(largest_s, (killed_ns - report.end_ns) * 1e-9)
+            (given_ns,) = struct.unpack_from("<q", Path(f"{path}.given").read_bytes(), 8 * len(numbers))
+            lost_s = (killed_ns - given_ns) * 1e-9 if given_ns else 0.0  # since the first that is missing was given
+            assert lost_s < 1.0, path
+            largest_s = max(largest_s, lost_s)
             with BagReader(path) as reader:
                 assert reader.custom_data == {"key": "value"}
     return largest_s
