@@ -64,6 +64,7 @@ class McapFile:
     ----------
     writer : the package's; after whatever was done with it, `push` brings what it has written into the file
     pieces : what it has written since then
+    stream : the file itself, unbuffered
     size_bytes : what is in the file so far
     counts, start_time_ns, end_time_ns : messages by channel, and their log times, in the file; 0 while there are none
     broken : a write has failed
@@ -97,7 +98,7 @@ class McapFile:
         self.writer = Writer(
             cast("IO[bytes]", self._buffer), chunk_size=chunk_bytes, compression=CompressionType[compression.upper()]
         )
-        self._stream: IO[bytes] = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by finish() or abandon()
+        self.stream: IO[bytes] = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by finish() or abandon()
         self.writer.start(profile, library)
         try:
             self.push()
@@ -124,9 +125,9 @@ class McapFile:
         data = b"".join(self.pieces)
         self.pieces.clear()
         try:
-            if self.size_bytes and os.fstat(self._stream.fileno()).st_nlink == 0:
+            if self.size_bytes and os.fstat(self.stream.fileno()).st_nlink == 0:
                 raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
-            self._append(data)
+            self.append(data)
         except OSError:
             self.broken = True
             raise
@@ -151,7 +152,7 @@ class McapFile:
 
     def duplicate_descriptor(self) -> int:
         """A descriptor of the open file that stays valid when this one is closed."""
-        return os.dup(self._stream.fileno())
+        return os.dup(self.stream.fileno())
 
     def finish(self, sync: bool = True) -> None:
         """Write the last chunk and the index, with `sync` wait until the disk has them, and close the file."""
@@ -160,24 +161,25 @@ class McapFile:
             self.writer.finish()
             self.push()
             if sync:
-                os.fsync(self._stream.fileno())
+                os.fsync(self.stream.fileno())
         finally:
-            self._stream.close()
+            self.stream.close()
 
     def abandon(self) -> None:
         """Close the file as it is; what is in it can be recovered."""
-        self._stream.close()
+        self.stream.close()
 
     def remove(self) -> None:
         """Close the file and delete it."""
-        self._stream.close()
+        self.stream.close()
         self.path.unlink(missing_ok=True)
 
-    def _append(self, data: bytes) -> None:
+    def append(self, data: bytes) -> None:
+        """Write bytes behind those that are in the file, all or none of them."""
         view = memoryview(data)
         try:
             while view:
-                written = self._stream.write(view)
+                written = self.stream.write(view)
                 view = view[written or 0 :]
         except OSError:
             self._cut()
@@ -186,7 +188,7 @@ class McapFile:
 
     def _cut(self) -> None:
         try:
-            self._stream.truncate(self.size_bytes)
-            self._stream.seek(self.size_bytes)
+            self.stream.truncate(self.size_bytes)
+            self.stream.seek(self.size_bytes)
         except OSError:
             pass  # a reader that goes as far as it can stops at the torn record

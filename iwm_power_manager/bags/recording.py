@@ -161,19 +161,19 @@ class Recording:
         BagError
             One is being recorded already, or the bag cannot be created.
         """
-        return self._call(self._start)
+        return self.call(self._start)
 
     def stop(self) -> Path:
         """Write what is queued, close the bag, return its path; `BagError` if none is being recorded."""
-        return self._call(self._stop)
+        return self.call(self._stop)
 
     def split(self) -> Path:
         """Close the current file of the bag and begin the next; returns the bag's path."""
-        return self._call(self._split)
+        return self.call(self._split)
 
     def snapshot(self) -> Path:
         """Write the messages of the last `snapshot_s` seconds to a bag of their own; returns its path."""
-        return self._call(self._snapshot)
+        return self.call(self._snapshot)
 
     def close(self) -> None:
         """Write what is queued, close the bag if there is one, end the thread.
@@ -186,7 +186,7 @@ class Recording:
         if not self._thread.is_alive():
             return
         try:
-            self._call(lambda: self._stop() if self._writer is not None else self.path)
+            self.call(lambda: self._stop() if self._writer is not None else self.path)
         finally:
             with self._wake:
                 self._closing = True
@@ -223,7 +223,8 @@ class Recording:
         self._queue.append(command)
         self._wake.notify()
 
-    def _call[T](self, command: Callable[[], T]) -> T:
+    def call[T](self, command: Callable[[], T]) -> T:
+        """Run something in the writing thread, behind all that was put; returns what it returns, or raises it."""
         future: Future[T] = Future()
 
         def run() -> None:

@@ -99,7 +99,7 @@ def test_a_half_written_chunk_is_cut_off_and_what_was_written_before_is_whole(
 ) -> None:
     file = fill(tmp_path / "a.mcap", 100)
     file.flush()
-    stream = file._stream
+    stream = file.stream
 
     class FullDisk:
         """Takes 100 bytes more, then none."""
@@ -117,12 +117,12 @@ def test_a_half_written_chunk_is_cut_off_and_what_was_written_before_is_whole(
         def __getattr__(self, name: str) -> object:
             return getattr(stream, name)
 
-    monkeypatch.setattr(file, "_stream", FullDisk())
+    monkeypatch.setattr(file, "stream", FullDisk())
     for i in range(100):
         file.writer.add_message(1, 5000 + i, bytes(range(100)), 0)
     with pytest.raises(OSError, match="No space left"):
         file.flush()
-    monkeypatch.setattr(file, "_stream", stream)
+    monkeypatch.setattr(file, "stream", stream)
     assert (file.message_count, file.broken) == (100, True)
     with pytest.raises(OSError, match="an earlier write has failed"):
         file.push()

@@ -40,7 +40,7 @@ class Journal:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, delay_s: float) -> None:
         self.events: list[Event] = []
-        fsync, fdatasync, append = os.fsync, os.fdatasync, mcap_file.McapFile._append
+        fsync, fdatasync, append = os.fsync, os.fdatasync, mcap_file.McapFile.append
 
         def synced(sync: Callable[[int], None], descriptor: int) -> None:
             path = os.readlink(f"/proc/self/fd/{descriptor}")
@@ -60,7 +60,7 @@ class Journal:
 
         monkeypatch.setattr(os, "fsync", lambda descriptor: synced(fsync, descriptor))
         monkeypatch.setattr(os, "fdatasync", lambda descriptor: synced(fdatasync, descriptor))
-        monkeypatch.setattr(mcap_file.McapFile, "_append", appended)
+        monkeypatch.setattr(mcap_file.McapFile, "append", appended)
 
     def _note(self, kind: str, path: str, size: int, names: tuple[str, ...] = ()) -> None:
         self.events.append(Event(time.monotonic_ns(), kind, path, size, names))

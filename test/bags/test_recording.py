@@ -48,9 +48,7 @@ def hold_the_writer(recording: Recording) -> threading.Event:
         entered.set()
         release.wait(30)
 
-    with recording._wake:
-        recording._queue.append(block)
-        recording._wake.notify()
+    threading.Thread(target=recording.call, args=(block,), daemon=True).start()
     assert entered.wait(30)
     return release
 
@@ -233,7 +231,7 @@ put = 0
 while not recording.failed.wait(0.0005):
     recording.put([(0, i, float64(i), i, i + 1) for i in range(put, put + 100)])
     put += 100
-status = recording._call(recording.status)  # behind all that was put
+status = recording.call(recording.status)  # behind all that was put
 read = values(disk / "bag")
 shutil.copytree(disk / "bag", elsewhere)
 recover(elsewhere)
@@ -290,7 +288,7 @@ def test_a_folder_that_becomes_read_only_keeps_the_present_file_and_fails_at_the
         recording.start()
         recording.add_topic(topic("/a"))
         recording.put(samples(0, 10))
-        recording._call(lambda: None)
+        recording.call(lambda: None)
         (folder / "bag").chmod(0o555)
         recording.put(samples(10, 10))  # the open file takes them
         with pytest.raises(BagError, match="bag: cannot be written: Permission denied"):
@@ -314,7 +312,7 @@ def test_a_folder_that_is_read_only_at_the_end_costs_the_metadata_alone(tmp_path
         recording.start()
         recording.add_topic(topic("/a"))
         recording.put(samples(0, 10))
-        recording._call(lambda: None)
+        recording.call(lambda: None)
         (folder / "bag").chmod(0o555)
         with pytest.raises(BagError, match=r"metadata\.yaml: cannot be written: Permission denied"):
             recording.stop()
@@ -374,8 +372,8 @@ def test_a_disk_error_while_closing_is_reported(tmp_path: Path, monkeypatch: pyt
     recording.start()
     recording.add_topic(topic("/a"))
     recording.put(samples(0, 3))
-    recording._call(lambda: None)  # all of that has reached the writer
-    monkeypatch.setattr(McapFile, "_append", full)
+    recording.call(lambda: None)  # all of that has reached the writer
+    monkeypatch.setattr(McapFile, "append", full)
     with pytest.raises(BagError, match="No space left on device"):
         recording.close()
     assert recording.status().dropped_error == 3
