@@ -81,6 +81,7 @@ class Policy:
     bound_j : certified max-norm distance of `cost_j` from the optimal cost-to-go
     converged : whether bound_j is within the problem's tolerance
     package_version : that solved it
+    residual_j : max norm of the Bellman residual of `cost_j`, J, where it was computed after solving; else None
     checksum : SHA-256 of the content, 64 hex digits: the policy's identity
     """
 
@@ -100,6 +101,17 @@ class Policy:
     converged: bool
     package_version: str
     checksum: str
+    residual_j: float | None = None
+
+    @property
+    def proven_j(self) -> float | None:
+        """What the residual proves: distance of `cost_j` from the optimal cost-to-go at most, J."""
+        return None if self.residual_j is None else self.residual_j / (1.0 - self.problem.discount)
+
+    def cost_by_state_j(self) -> NDArray[np.float64]:
+        """`cost_j` as the solver has it: float64[P, S, C]."""
+        powers, _, _, _, shares = self.problem.shape
+        return np.ascontiguousarray(self.cost_j.reshape(powers, -1, shares).transpose(0, 2, 1))
 
     def check_vehicle(self, vehicle: Vehicle, name: str = "policy") -> None:
         """Raise `PolicyError` unless this policy was solved for this car: for every number the decision model reads."""
@@ -215,6 +227,11 @@ def make_policy(
     return _with_checksum(policy)
 
 
+def with_residual(policy: Policy, residual_j: float) -> Policy:
+    """The policy with the Bellman residual of its cost-to-go, J: another file, another checksum."""
+    return _with_checksum(dataclasses.replace(policy, residual_j=residual_j))
+
+
 def _with_checksum(policy: Policy) -> Policy:
     arrays, metadata = _content(policy)
     return dataclasses.replace(policy, checksum=checksum_of(arrays, metadata))
@@ -229,7 +246,7 @@ def _content(policy: Policy) -> tuple[dict[str, NDArray[np.float64]], bytes]:
         "demand_by_speed": policy.chain.by_speed,
         "demand_steps": policy.chain.row_steps,
     }
-    metadata = {
+    metadata: dict[str, Any] = {
         "format": FORMAT_NAME,
         "format_version": FORMAT_VERSION,
         "package_version": policy.package_version,
@@ -246,6 +263,9 @@ def _content(policy: Policy) -> tuple[dict[str, NDArray[np.float64]], bytes]:
             "prices_tried": [list(trial) for trial in policy.trials],
         },
     }
+    if policy.residual_j is not None:
+        metadata["solver"]["residual_j"] = policy.residual_j
+        metadata["solver"]["proven_j"] = policy.proven_j
     return arrays, json.dumps(metadata, indent=1, sort_keys=True, allow_nan=False).encode()
 
 
@@ -383,6 +403,7 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
             converged=bool(solver["converged"]),
             package_version=str(metadata["package_version"]),
             checksum=checksum,
+            residual_j=check_number(path, "residual_j", solver["residual_j"], 0.0) if "residual_j" in solver else None,
         )
     except ConfigError as error:
         raise PolicyError(str(error)) from None

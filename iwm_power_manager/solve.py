@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from iwm_power_manager.control.budget import DEARER
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.mdp.budget import Trial, find_price
+from iwm_power_manager.mdp.certify import bellman_residual_j
 from iwm_power_manager.mdp.demand import DemandChain, Source
 from iwm_power_manager.mdp.policy_iteration import Iteration, Model, Solution, solve
 from iwm_power_manager.mdp.problem import Problem, load_problem
 from iwm_power_manager.mdp.transitions import build_model
 from iwm_power_manager.model.parameters import VehicleParams
-from iwm_power_manager.policy import Policy, cost_quantum_j, make_policy, save_policy
+from iwm_power_manager.policy import Policy, cost_quantum_j, make_policy, save_policy, with_residual
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle
 
@@ -75,8 +76,12 @@ def solve_one(
     sources: Sequence[Source],
     path: Path,
     update: Callable[[Iteration], None] = lambda _: None,
+    verify: bool = False,
 ) -> Solved:
-    """Solve for one road, write the policy, and say what it took; `update` hears of every iteration."""
+    """Solve for one road, write the policy, and say what it took; `update` hears of every iteration.
+
+    With `verify`, the Bellman residual of what is stored is computed from the problem alone and stored, too.
+    """
     started = time.perf_counter()
     problem = problem.on_road(friction)
     model = build_model(problem, vehicle.params, friction, chain.matrix)
@@ -96,6 +101,9 @@ def solve_one(
     dearer = [_priced(model, problem, factor, tolerance, lambda _: None, solution.cost_j) for factor in factors]
     done = time.perf_counter()
     policy = make_policy(problem, vehicle, friction, chain, sources, solution, dearer, trials)
+    if verify:
+        priced = model._replace(switching_j=problem.switching_cost())
+        policy = with_residual(policy, bellman_residual_j(priced, policy.cost_by_state_j()))
     save_policy(policy, path)
     return Solved(policy, path, built - started, done - built)
 

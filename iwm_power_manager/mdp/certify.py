@@ -15,8 +15,8 @@ from iwm_power_manager.jit import kernel
 from iwm_power_manager.mdp.policy_iteration import Model, corner_steps, expect_over_demand, improve
 
 
-def bellman_bound(model: Model, cost_j: NDArray[np.float64]) -> float:
-    """Certified max-norm distance of a cost-to-go from the optimal one, J.
+def bellman_residual_j(model: Model, cost_j: NDArray[np.float64]) -> float:
+    """Max norm of T J - J, J. Over 1 - gamma it is a bound on the distance of J from the optimal cost-to-go.
 
     Parameters
     ----------
@@ -30,7 +30,12 @@ def bellman_bound(model: Model, cost_j: NDArray[np.float64]) -> float:
     expect_over_demand(model.demand, flat, cost_j.shape[2], plane, 0, flat.shape[1], ahead.reshape(rows, -1))
     improved = np.empty_like(cost_j)
     improve(model, ahead, 0, rows, improved, np.empty(cost_j.shape, dtype=np.int16))
-    return float(np.max(np.abs(improved - cost_j))) / (1.0 - model.discount)
+    return float(np.max(np.abs(improved - cost_j)))
+
+
+def bellman_bound(model: Model, cost_j: NDArray[np.float64]) -> float:
+    """Certified max-norm distance of a cost-to-go float64[P, S, C] from the optimal one, J."""
+    return bellman_residual_j(model, cost_j) / (1.0 - model.discount)
 
 
 @kernel

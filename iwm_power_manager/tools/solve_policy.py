@@ -126,6 +126,11 @@ def parser() -> argparse.ArgumentParser:
     output.add_argument(
         "--export-mdp", metavar="NPZ", help="the exact problem, for another solver (one friction; docs/solver.md)"
     )
+    output.add_argument(
+        "--verify",
+        action="store_true",
+        help="compute the Bellman residual of each policy after solving, and store it and what it proves in the file",
+    )
     output.add_argument("--quiet", action="store_true", help="print errors only")
     output.add_argument("--check", nargs="+", metavar="POLICY", help="verify policy files instead of solving")
     return result
@@ -158,7 +163,7 @@ def _solve(options: argparse.Namespace) -> int:
     solved = []
     for friction, path in zip(frictions, paths, strict=True):
         with _Progress(f"friction {friction:g}", problem.tolerance_j, options.quiet) as progress:
-            solved.append(solve_one(problem, vehicle, friction, chain, sources, path, progress.update))
+            solved.append(solve_one(problem, vehicle, friction, chain, sources, path, progress.update, options.verify))
         say(_convergence_text(solved[-1]))
     if options.export_mdp:
         solved_problem = problem.on_road(frictions[0])
@@ -250,9 +255,8 @@ def _check(options: argparse.Namespace) -> int:
         policy = load_policy(path)
         policy.check_vehicle(vehicle, str(path))
         model = build_model(policy.problem, vehicle.params, policy.friction, policy.chain.matrix)
-        powers, speeds, fronts, rears, shares = policy.problem.shape
-        cost = policy.cost_j.reshape(powers, speeds * fronts * rears, shares).transpose(0, 2, 1)
-        bound = bellman_bound(model, np.ascontiguousarray(cost))
+        cost = policy.cost_by_state_j()
+        bound = bellman_bound(model, cost)
         # A cost-to-go within b of the optimum has a residual of at most (1 + gamma) b.
         claimed = policy.bound_j * (1.0 + policy.problem.discount) / (1.0 - policy.problem.discount)
         good = bound <= claimed + 1e-9 * float(np.max(np.abs(cost)))
@@ -331,6 +335,8 @@ def _convergence_text(result: Solved) -> str:
     if policy.trials:
         lines.append("price of a change, J: changes a minute")
         lines.append("  " + "".join(f"{t.price_j:.4g}: {t.changes_per_min:<8.3g}" for t in policy.trials).rstrip())
+    if policy.residual_j is not None:
+        lines.append(f"verified: Bellman residual {policy.residual_j:.2g} J, proves {policy.proven_j:.2g} J")
     verdict = "certified" if policy.converged else "NOT within the tolerance: only certified"
     lines.append(
         f"{verdict} to {policy.bound_j:.2g} J in {result.build_s:.2f} + {result.solve_s:.2f} s (tabulate + solve)\n"
@@ -357,6 +363,8 @@ def _numbers(chain: DemandChain, sources: Sequence[Source], solved: Sequence[Sol
                 "checksum": result.policy.checksum,
                 "vehicle_hash": result.policy.vehicle_hash,
                 "bound_j": result.policy.bound_j,
+                "residual_j": result.policy.residual_j,
+                "proven_j": result.policy.proven_j,
                 "converged": result.policy.converged,
                 "build_s": result.build_s,
                 "solve_s": result.solve_s,

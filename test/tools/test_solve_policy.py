@@ -75,6 +75,27 @@ def test_it_writes_one_verified_policy_for_each_road(grid, tmp_path, capsys):
     assert np.sum(numbers["demand"]["row_steps"]) == 5979.0
 
 
+def test_verify_stores_the_residual_and_what_it_proves(grid, tmp_path, capsys):
+    plain, verified, report = tmp_path / "plain.npz", tmp_path / "verified.npz", tmp_path / "run.json"
+    assert _solve(grid, "--friction", 0.5, "--output", plain) == 0
+    assert _solve(grid, "--friction", 0.5, "--output", verified, "--verify", "--json", report) == 0
+    before, policy = load_policy(plain), load_policy(verified)
+    assert before.residual_j is before.proven_j is None
+    assert np.array_equal(policy.cost_j, before.cost_j)
+    assert policy.checksum != before.checksum
+    # Within b of the optimum the residual is (1 + gamma) b at most; a residual r proves r / (1 - gamma).
+    assert 0.0 < policy.residual_j <= 1.9 * policy.bound_j
+    assert policy.proven_j == pytest.approx(policy.residual_j / 0.1)
+    (numbers,) = json.loads(report.read_text())["policies"]
+    assert (numbers["residual_j"], numbers["proven_j"]) == (policy.residual_j, policy.proven_j)
+    stored = json.loads(np.load(verified)["metadata"].tobytes())["solver"]
+    assert (stored["residual_j"], stored["proven_j"]) == (policy.residual_j, policy.proven_j)
+    assert f"proves {policy.proven_j:.2g} J" in capsys.readouterr().out
+    # The check, which builds the problem anew, finds the same.
+    assert _run("--vehicle", "jalalmaab_2015", "--check", verified) == 0
+    assert f"residual proves {policy.proven_j:.3g} J" in capsys.readouterr().out
+
+
 def test_the_price_of_a_change_is_that_of_the_road_and_is_paid(tmp_path):
     path = tmp_path / "by_road.yaml"
     path.write_text(GRID.replace("switching_cost_j: 20", "switching_cost_by_friction: [[0.2, 60], [0.6, 20]]"))
