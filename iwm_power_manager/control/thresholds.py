@@ -7,197 +7,136 @@ here, so that no threshold stands twice.
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from typing import Annotated, NamedTuple
+from typing import Any
 
 from iwm_power_manager.control.actuators import ActuatorLimits
 from iwm_power_manager.control.inputs import StampLimits, ValueLimits, WheelLimits
 from iwm_power_manager.control.monitor import InputLimits
-from iwm_power_manager.control.settings import Change, Setting, table_of
+from iwm_power_manager.control.settings import Change, Setting
 from iwm_power_manager.control.supervision import SupervisionLimits
 
 _INF = math.inf
 
 
-def _threshold(meaning: str, unit: str, low: float, high: float) -> Setting:
-    return Setting(meaning, unit, low, high, change=Change.UNCONFIGURED)
+def _threshold(default: float, unit: str, low: float, high: float, meaning: str) -> Any:
+    known = Setting(meaning, unit, low, high, change=Change.UNCONFIGURED)
+    return dataclasses.field(default=default, metadata={"known": known})
 
 
-class Thresholds(NamedTuple):
-    """Each with its type, what is known of it, and its default with the reason for it."""
+@dataclasses.dataclass(frozen=True)
+class Thresholds:
+    """Each with its type, its default with the reason for it, and what is known of it."""
 
-    stamp_oldest_s: Annotated[
-        float, _threshold("a message stamped longer ago than this is dropped", "s", 0.001, 60.0)
-    ] = 0.1
+    stamp_oldest_s: float = _threshold(0.1, "s", 0.001, 60.0, "a message stamped longer ago than this is dropped")
     # Clocks of two computers are never quite equal.
-    stamp_future_s: Annotated[
-        float, _threshold("a message stamped further ahead than this is dropped", "s", 0.0, 60.0)
-    ] = 0.02
-    speed_max_mps: Annotated[float, _threshold("largest believed vehicle speed, either way", "m/s", 1.0, 150.0)] = 60.0
+    stamp_future_s: float = _threshold(0.02, "s", 0.0, 60.0, "a message stamped further ahead than this is dropped")
+    speed_max_mps: float = _threshold(60.0, "m/s", 1.0, 150.0, "largest believed vehicle speed, either way")
     # No road car brakes or drives off at more than 1.5 g; a crash is none of our business.
-    speed_rate_mps2: Annotated[float, _threshold("largest believed change of vehicle speed", "m/s2", 1.0, 1000.0)] = (
-        25.0
-    )
-    speed_noise_mps: Annotated[
-        float, _threshold("change of vehicle speed that is always believed", "m/s", 0.0, 5.0)
-    ] = 0.6
+    speed_rate_mps2: float = _threshold(25.0, "m/s2", 1.0, 1000.0, "largest believed change of vehicle speed")
+    speed_noise_mps: float = _threshold(0.6, "m/s", 0.0, 5.0, "change of vehicle speed that is always believed")
     # A car that rolls back unbraked; faster it does not drive backwards.
-    speed_min_mps: Annotated[float, _threshold("smallest believed vehicle speed", "m/s", -150.0, 0.0)] = -30.0
-    wheel_speed_max_radps: Annotated[
-        float, _threshold("largest believed wheel speed, either way", "rad/s", 1.0, 2000.0)
-    ] = 300.0
+    speed_min_mps: float = _threshold(-30.0, "m/s", -150.0, 0.0, "smallest believed vehicle speed")
+    wheel_speed_max_radps: float = _threshold(300.0, "rad/s", 1.0, 2000.0, "largest believed wheel speed, either way")
     # Full braking torque on a wheel without grip: 900 N m on 1.1 kg m2 is 820 rad/s2; twice that.
-    wheel_rate_radps2: Annotated[float, _threshold("largest believed change of a wheel speed", "rad/s2", 1.0, 1e5)] = (
-        2000.0
+    wheel_rate_radps2: float = _threshold(2000.0, "rad/s2", 1.0, 1e5, "largest believed change of a wheel speed")
+    wheel_noise_radps: float = _threshold(3.0, "rad/s", 0.0, 50.0, "change of a wheel speed that is always believed")
+    wheel_opposite_radps: float = _threshold(
+        3.0, "rad/s", 0.0, 50.0, "backward wheel speed that is believed while the car drives forwards"
     )
-    wheel_noise_radps: Annotated[
-        float, _threshold("change of a wheel speed that is always believed", "rad/s", 0.0, 50.0)
-    ] = 3.0
-    wheel_opposite_radps: Annotated[
-        float,
-        _threshold("backward wheel speed that is believed while the car drives forwards", "rad/s", 0.0, 50.0),
-    ] = 3.0
-    wheel_moving_mps: Annotated[
-        float, _threshold("above this speed the car counts as driving forwards", "m/s", 0.1, 10.0)
-    ] = 1.0
+    wheel_moving_mps: float = _threshold(1.0, "m/s", 0.1, 10.0, "above this speed the car counts as driving forwards")
     # Longer than the gate needs to free a wheel that really is locked: that one turns again when its torque is gone.
-    wheel_stuck_s: Annotated[
-        float,
-        _threshold(
-            "a wheel speed that stays the same for longer while the car and the axle's other wheel change is stuck",
-            "s",
-            0.05,
-            60.0,
-        ),
-    ] = 1.0
-    wheel_stuck_change_radps: Annotated[
-        float,
-        _threshold("change of the car and the other wheel that tells a stuck one", "rad/s", 0.1, 50.0),
-    ] = 1.0
-    wheel_stray_s: Annotated[
-        float,
-        _threshold(
-            "a wheel speed far from both the axle's other wheel and the car for longer is lost",
-            "s",
-            0.05,
-            60.0,
-        ),
-    ] = 1.0
-    wheel_stray_radps: Annotated[float, _threshold("how far is far", "rad/s", 1.0, 500.0)] = 20.0
-    wheel_distrust_s: Annotated[
-        float,
-        _threshold("a lost wheel has to be good for this long before it is used again", "s", 0.0, 60.0),
-    ] = 0.5
+    wheel_stuck_s: float = _threshold(
+        1.0,
+        "s",
+        0.05,
+        60.0,
+        "a wheel speed that stays the same for longer while the car and the axle's other wheel change is stuck",
+    )
+    wheel_stuck_change_radps: float = _threshold(
+        1.0, "rad/s", 0.1, 50.0, "change of the car and the other wheel that tells a stuck one"
+    )
+    wheel_stray_s: float = _threshold(
+        1.0, "s", 0.05, 60.0, "a wheel speed far from both the axle's other wheel and the car for longer is lost"
+    )
+    wheel_stray_radps: float = _threshold(20.0, "rad/s", 1.0, 500.0, "how far is far")
+    wheel_distrust_s: float = _threshold(
+        0.5, "s", 0.0, 60.0, "a lost wheel has to be good for this long before it is used again"
+    )
     # Longer than any burst of bad values, shorter than what a driver notices.
-    rival_s: Annotated[
-        float,
-        _threshold(
-            "two sources of an input: the refused one is believed after this (battery: ten times), a speed only "
-            "if it is nearer to the wheels",
-            "s",
-            0.05,
-            60.0,
-        ),
-    ] = 0.3
+    rival_s: float = _threshold(
+        0.3,
+        "s",
+        0.05,
+        60.0,
+        "two sources of an input: the refused one is believed after this (battery: ten times), a speed only "
+        "if it is nearer to the wheels",
+    )
     # A torque is reckoned from currents: to a tenth or so at best.
-    motor_tolerance_nm: Annotated[
-        float, _threshold("difference of reported and commanded motor torque that is always believed", "N m", 0.1, 1e3)
-    ] = 8.0
-    motor_tolerance_ratio: Annotated[
-        float, _threshold("the same as a part of the commanded torque, on top", "", 0.0, 1.0)
-    ] = 0.15
+    motor_tolerance_nm: float = _threshold(
+        8.0, "N m", 0.1, 1e3, "difference of reported and commanded motor torque that is always believed"
+    )
+    motor_tolerance_ratio: float = _threshold(0.15, "", 0.0, 1.0, "the same as a part of the commanded torque, on top")
     # Three periods of a slow bus, the motor's own lag, and a message each way.
-    motor_lag_s: Annotated[
-        float, _threshold("a reported motor torque may belong to any command of this time", "s", 0.0, 1.0)
-    ] = 0.06
-    motor_confirm_s: Annotated[
-        float, _threshold("a motor whose reports differ for longer is weak, dead, stuck or reversed", "s", 0.01, 60.0)
-    ] = 0.1
-    motor_recover_s: Annotated[
-        float,
-        _threshold("a weak motor has to follow for this long to count as good again", "s", 0.0, 600.0),
-    ] = 2.0
-    demand_max_w: Annotated[float, _threshold("largest believed driving demand", "W", 100.0, 5e6)] = 150e3
-    demand_min_w: Annotated[float, _threshold("largest believed braking demand, negative", "W", -2e7, -100.0)] = -600e3
-    demand_rise_wps: Annotated[
-        float,
-        _threshold(
-            "largest believed rise of the demand; braking may come as fast as it likes",
-            "W/s",
-            1e3,
-            1e9,
-        ),
-    ] = 5e6
-    demand_noise_w: Annotated[float, _threshold("rise of the demand that is always believed", "W", 0.0, 1e6)] = 5e3
+    motor_lag_s: float = _threshold(
+        0.06, "s", 0.0, 1.0, "a reported motor torque may belong to any command of this time"
+    )
+    motor_confirm_s: float = _threshold(
+        0.1, "s", 0.01, 60.0, "a motor whose reports differ for longer is weak, dead, stuck or reversed"
+    )
+    motor_recover_s: float = _threshold(
+        2.0, "s", 0.0, 600.0, "a weak motor has to follow for this long to count as good again"
+    )
+    demand_max_w: float = _threshold(150e3, "W", 100.0, 5e6, "largest believed driving demand")
+    demand_min_w: float = _threshold(-600e3, "W", -2e7, -100.0, "largest believed braking demand, negative")
+    demand_rise_wps: float = _threshold(
+        5e6, "W/s", 1e3, 1e9, "largest believed rise of the demand; braking may come as fast as it likes"
+    )
+    demand_noise_w: float = _threshold(5e3, "W", 0.0, 1e6, "rise of the demand that is always believed")
     # A full charge takes minutes.
-    soc_rate_per_s: Annotated[float, _threshold("largest believed change of the state of charge", "1/s", 1e-4, 1e3)] = (
-        0.01
+    soc_rate_per_s: float = _threshold(0.01, "1/s", 1e-4, 1e3, "largest believed change of the state of charge")
+    soc_noise: float = _threshold(0.02, "", 0.0, 1.0, "change of the state of charge that is always believed")
+    temperature_min_c: float = _threshold(-60.0, "degC", -100.0, 0.0, "lowest believed temperature of the battery")
+    temperature_max_c: float = _threshold(150.0, "degC", 50.0, 500.0, "highest believed temperature of the battery")
+    temperature_rate_cps: float = _threshold(
+        2.0, "K/s", 0.01, 1e3, "largest believed change of the battery's temperature"
     )
-    soc_noise: Annotated[float, _threshold("change of the state of charge that is always believed", "", 0.0, 1.0)] = (
-        0.02
+    temperature_noise_c: float = _threshold(
+        3.0, "K", 0.0, 100.0, "change of the battery's temperature that is always believed"
     )
-    temperature_min_c: Annotated[
-        float, _threshold("lowest believed temperature of the battery", "degC", -100.0, 0.0)
-    ] = -60.0
-    temperature_max_c: Annotated[
-        float, _threshold("highest believed temperature of the battery", "degC", 50.0, 500.0)
-    ] = 150.0
-    temperature_rate_cps: Annotated[
-        float, _threshold("largest believed change of the battery's temperature", "K/s", 0.01, 1e3)
-    ] = 2.0
-    temperature_noise_c: Annotated[
-        float, _threshold("change of the battery's temperature that is always believed", "K", 0.0, 100.0)
-    ] = 3.0
-    friction_min: Annotated[float, _threshold("smallest believed friction coefficient", "", 0.01, 0.5)] = 0.05
-    friction_max: Annotated[float, _threshold("largest believed friction coefficient", "", 0.5, 3.0)] = 1.5
-    fade_s: Annotated[
-        float, _threshold("an input is missing: motor torque fades to zero in this time", "s", 0.01, 10.0)
-    ] = 0.3
-    brake_release_s: Annotated[
-        float,
-        _threshold(
-            "power_demand is missing while braking: the braking force is released in this time",
-            "s",
-            0.01,
-            30.0,
-        ),
-    ] = 2.0
-    recover_s: Annotated[
-        float, _threshold("inputs have to be good for this long before torque comes back", "s", 0.0, 60.0)
-    ] = 0.5
-    resume_s: Annotated[float, _threshold("torque comes back from zero to full in this time", "s", 0.01, 60.0)] = 0.5
+    friction_min: float = _threshold(0.05, "", 0.01, 0.5, "smallest believed friction coefficient")
+    friction_max: float = _threshold(1.5, "", 0.5, 3.0, "largest believed friction coefficient")
+    fade_s: float = _threshold(0.3, "s", 0.01, 10.0, "an input is missing: motor torque fades to zero in this time")
+    brake_release_s: float = _threshold(
+        2.0, "s", 0.01, 30.0, "power_demand is missing while braking: the braking force is released in this time"
+    )
+    recover_s: float = _threshold(0.5, "s", 0.0, 60.0, "inputs have to be good for this long before torque comes back")
+    resume_s: float = _threshold(0.5, "s", 0.01, 60.0, "torque comes back from zero to full in this time")
     # A step is short of its period when the one before came late, and longer when it is late itself. Much shorter ones
     # would turn the noise of wheel speeds into road torque; longer ones would let a torque jump.
-    shortest_step_periods: Annotated[
-        float,
-        _threshold("a step counts as at least this part of the control period", "periods", 0.01, 1.0),
-    ] = 0.2
-    longest_step_periods: Annotated[
-        float, _threshold("a step counts as at most this many control periods", "periods", 1.0, 100.0)
-    ] = 3.0
+    shortest_step_periods: float = _threshold(
+        0.2, "periods", 0.01, 1.0, "a step counts as at least this part of the control period"
+    )
+    longest_step_periods: float = _threshold(
+        3.0, "periods", 1.0, 100.0, "a step counts as at most this many control periods"
+    )
     # Ten periods of the control loop and the age at which inputs are missing: what was remembered is no longer true.
-    own_gap_s: Annotated[
-        float,
-        _threshold(
-            "the node itself was held up for longer: it starts over as after activation",
-            "s",
-            0.02,
-            60.0,
-        ),
-    ] = 0.1
+    own_gap_s: float = _threshold(
+        0.1, "s", 0.02, 60.0, "the node itself was held up for longer: it starts over as after activation"
+    )
     # At 20 m/s the car has moved a metre.
-    command_oldest_s: Annotated[
-        float,
-        _threshold("a command that took longer from its inputs to its sending is not sent", "s", 0.001, 1.0),
-    ] = 0.05
+    command_oldest_s: float = _threshold(
+        0.05, "s", 0.001, 1.0, "a command that took longer from its inputs to its sending is not sent"
+    )
 
 
 #: What is known of each threshold, by name.
-TABLE = table_of(Thresholds)
+TABLE: dict[str, Setting] = {field.name: field.metadata["known"] for field in dataclasses.fields(Thresholds)}
 
 #: What recorded inputs are judged by: finite, and possible for any car. What a node would have missed by its clock and
 #: its car's limits is part of the record.
-RECORDED = Thresholds()._replace(
+RECORDED = Thresholds(
     speed_max_mps=150.0,
     speed_rate_mps2=100.0,
     speed_noise_mps=1.0,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -95,7 +96,7 @@ SPECS = (
     Spec("input_period_s.wheel_states", 0.01, "Period of wheel_states, s.", 0.0005, 10.0),
     Spec("input_period_s.power_demand", 0.01, "Period of power_demand, s.", 0.0005, 10.0),
     Spec("input_period_s.battery_state", 0.1, "Period of battery_state, s.", 0.0005, 10.0),
-    *_specs(thresholds.TABLE, thresholds.Thresholds()._asdict()),
+    *_specs(thresholds.TABLE, dataclasses.asdict(thresholds.Thresholds())),
     Spec(
         "clock_stopped_s",
         0.5,

@@ -287,7 +287,7 @@ class TestBattery:
         values = drive.run(60, demand=-4000.0, soc=1.0)
         assert values["charge_limit_w"] == 0.0
         # A little braking torque is left to the motors: what their own losses eat up.
-        assert wheels_power_w(motor(values), (10.0 / RADIUS,) * 4, 1.0, VEHICLE) >= -1e-6
+        assert wheels_power_w(tuple(motor(values)), (10.0 / RADIUS,) * 4, 1.0, VEHICLE) >= -1e-6
         assert (sum(friction(values)) + sum(motor(values))) * 10.0 / RADIUS == pytest.approx(-4000.0)
         assert sum(friction(values)) < 10.0 * sum(motor(values))
 

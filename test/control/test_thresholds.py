@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import pytest
@@ -11,7 +12,7 @@ from iwm_power_manager.control import settings, thresholds
 from iwm_power_manager.control.settings import Change
 from iwm_power_manager.control.thresholds import RECORDED, Thresholds, actuator_limits, input_limits, supervision_limits
 
-DIFFERENT = Thresholds(*(float(k + 1) for k in range(len(Thresholds._fields))))
+DIFFERENT = Thresholds(*(float(k + 1) for k in range(len(thresholds.TABLE))))
 
 
 def numbers_in(value):
@@ -29,9 +30,9 @@ def test_every_default_is_inside_its_range_and_has_a_meaning():
             assert known.meaning
 
 
-@pytest.mark.parametrize("name", Thresholds._fields)
+@pytest.mark.parametrize("name", thresholds.TABLE)
 def test_no_threshold_is_without_effect(name):
-    changed = DIFFERENT._replace(**{name: 1000.0})
+    changed = dataclasses.replace(DIFFERENT, **{name: 1000.0})
     stepping = ("shortest_step_periods", "longest_step_periods", "own_gap_s", "command_oldest_s")
     same = (
         numbers_in(input_limits(changed, 0.3, True)) == numbers_in(input_limits(DIFFERENT, 0.3, True)),
