@@ -21,17 +21,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
+from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
-from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.recording import Recording
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.replay.plan import Choice, make_plan
@@ -198,9 +199,9 @@ def _read(folder: Path, steps: int) -> dict[str, float]:
     mapping = load_mapping()
     choice = Choice(strategy="instantaneous_slip")
 
-    def replay(path: Path, output: Path | None, wanted: Choice) -> int:
+    def replay(path: Path, output: Path | None, wanted: Choice, reader: type[BagReader] = BagReader) -> int:
         count = 0
-        with BagReader(path) as bag:
+        with reader(path) as bag:
             plan = make_plan(wanted, bag.custom_data)
             run = Replay(bag, plan, mapping)
             writer = BagWriter(output, WriterOptions(), bag.custom_data) if output else None
@@ -226,8 +227,8 @@ def _read(folder: Path, steps: int) -> dict[str, float]:
                 count += 1
         return count
 
-    def ours() -> int:
-        with BagReader(drive) as bag:
+    def raw(reader: type[BagReader]) -> int:
+        with reader(drive) as bag:
             return sum(1 for _ in bag.messages())
 
     def again(path: Path) -> int:
@@ -239,14 +240,36 @@ def _read(folder: Path, steps: int) -> dict[str, float]:
         {
             reference: lambda: bare(True),
             "AnyReader, raw": lambda: bare(False),
-            "BagReader, raw": ours,
+            "mcap's reader, raw": lambda: raw(_ThroughMcap),
+            "BagReader, raw": lambda: raw(BagReader),
             "replay with control, compared": lambda: replay(drive, None, Choice()),
+            "  the same through mcap's reader": lambda: replay(drive, None, Choice(), _ThroughMcap),
+            "  the same through rosbags' reader": lambda: replay(drive, None, Choice(), _ThroughRosbags),
             "replay with control, compared and written": lambda: again(drive),
             "replay from inputs alone, written": lambda: again(inputs),
         },
         reference,
         f"read a drive of {steps} steps",
     )
+
+
+class _ThroughMcap(BagReader):
+    """Messages as the `mcap` package reads them: nothing is bounded."""
+
+    def messages(self) -> Iterator[Message]:
+        for path in sorted(self.path.glob("*.mcap")):
+            with path.open("rb") as stream:
+                for _, channel, found in make_reader(stream).iter_messages():
+                    yield Message(found.log_time, channel.topic, found.data, found.publish_time, found.sequence)
+
+
+class _ThroughRosbags(BagReader):
+    """Messages as rosbags reads them: nothing is bounded, and when they were sent and their numbers are not there."""
+
+    def messages(self) -> Iterator[Message]:
+        with Reader(self.path) as reader:
+            for connection, log_time, data in reader.messages():
+                yield Message(log_time, connection.topic, data, log_time, 0)
 
 
 def _write_inputs(path: Path, steps: int) -> None:

@@ -11,10 +11,11 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -388,8 +389,8 @@ class Recording:
         return path
 
 
-def _size(samples: Iterable[Sample]) -> int:
-    return sum(len(sample[2]) + MESSAGE_OVERHEAD_BYTES for sample in samples)
+def _size(samples: Sequence[Sample]) -> int:
+    return sum(map(len, map(itemgetter(2), samples))) + MESSAGE_OVERHEAD_BYTES * len(samples)
 
 
 def _free_name(path: Path, kind: str, number: int) -> Path:

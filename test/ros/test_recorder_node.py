@@ -476,29 +476,30 @@ def kill_while_publishing(path: Path, recorder: Callable[..., RecorderProcess], 
     deadline = time.monotonic() + PATIENCE_S
     try:
         started_ns = time.time_ns()
-        count = 0
+        published_ns: list[int] = []
         while process.process.poll() is None:
-            numbers.publish(Float64(data=float(count)))
-            count += 1
             now = time.time_ns()
+            numbers.publish(Float64(data=float(len(published_ns))))
+            published_ns.append(now)
             if not matched_ns and numbers.get_subscription_count():
                 matched_ns = now
             if matched_ns and not killed_ns and now - matched_ns >= delay_s * 1e9:
                 process.process.kill()
                 killed_ns = time.time_ns()
             assert time.monotonic() < deadline
-            time.sleep(max(0.0, (started_ns + count * 1_000_000 - time.time_ns()) * 1e-9))
+            time.sleep(max(0.0, (started_ns + len(published_ns) * 1_000_000 - time.time_ns()) * 1e-9))
     finally:
         peer.close()
     report = recover(path)
     if report.files[0].message_count == 0:
         lost_s = (killed_ns - matched_ns) * 1e-9
     else:
-        lost_s = (killed_ns - report.end_ns) * 1e-9
         with BagReader(path) as reader:
             messages = list(reader.messages())
             assert reader.damage == []
         sequences = [message.sequence for message in messages]
+        first_missing = sequences[-1]  # its number, which is one less than its sequence
+        lost_s = (killed_ns - published_ns[first_missing]) * 1e-9 if first_missing < len(published_ns) else 0.0
         assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
         assert [m.data for m in messages] == [serialize_message(Float64(data=float(n - 1))) for n in sequences]
     assert lost_s < 1.0, f"killed after {delay_s:.3f} s: lost {lost_s:.3f} s"
