@@ -7,6 +7,7 @@ same numbers give the same bits.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -179,6 +180,7 @@ def run(
     until_s: float = np.inf,
     noise: Noise = NO_NOISE,
     plant_vehicle: Vehicle | None = None,
+    table_of: Callable[[float], PolicyTable] | None = None,
 ) -> Run:
     """Drive a cycle.
 
@@ -195,6 +197,8 @@ def run(
     until_s : drive only so much of the cycle
     noise : errors of the sensors
     plant_vehicle : the car as it is, if it differs
+    table_of : the policy for a friction; with it, the law is told the friction it has estimated, from
+        `settings.friction_prior` on, and `policy` and `assumed_friction` do not count
     """
     params = vehicle.params
     truth = params if plant_vehicle is None else plant_vehicle.params
@@ -204,22 +208,30 @@ def run(
     series = np.empty((trace.speed_mps.size, len(COLUMNS)))
     start = plant.initial_plant(truth, soc, float(trace.speed_mps[0]))
     told = friction if assumed_friction is None else assumed_friction
-    final = _loop(
-        trace,
-        start,
-        initial_state(),
-        settings,
-        params,
-        truth,
-        policy,
-        float(friction),
-        float(told),
-        float(dt_s),
-        int(substeps),
-        noise,
-        series,
-    )
-    return Run(dt_s, series, final)
+    if table_of is not None:
+        told = settings.friction_prior
+        policy = table_of(told)
+    at = Progress(0, start, initial_state(), DriverState(0.0))
+    while at.steps < len(series):
+        at = _loop(
+            trace,
+            at,
+            settings,
+            params,
+            truth,
+            policy,
+            float(friction),
+            float(told),
+            table_of is not None,
+            float(dt_s),
+            int(substeps),
+            noise,
+            series,
+        )
+        if table_of is not None:
+            told = at.controller.friction.assumed
+            policy = table_of(told)
+    return Run(dt_s, series, at.car)
 
 
 @kernel
@@ -322,25 +334,36 @@ def shaken(pedals: Pedals, travel: float, speed_mps: float, vehicle: VehiclePara
     return Pedals(accelerator, brake, pedal_power_w(accelerator, brake, speed_mps, vehicle))
 
 
+class Progress(NamedTuple):
+    """How far a drive has come: steps taken, and what lives from one to the next."""
+
+    steps: int
+    car: plant.PlantState
+    controller: ControllerState
+    foot: DriverState
+
+
 @kernel
 def _loop(
     trace: Trace,
-    car: plant.PlantState,
-    controller: ControllerState,
+    at: Progress,
     settings: Settings,
     vehicle: VehicleParams,
     truth: VehicleParams,
     policy: PolicyTable,
     friction: float,
     assumed_friction: float,
+    estimated: bool,
     dt_s: float,
     substeps: int,
     noise: Noise,
     series: FloatArray,
-) -> plant.PlantState:
+) -> Progress:
+    """Steps to the end of the trace; or, where the friction is estimated, until another one is to be assumed."""
     road = (friction, friction, friction, friction)
-    foot = DriverState(0.0)
-    for k in range(trace.speed_mps.size):
+    car, controller, foot = at.car, at.controller, at.foot
+    steps = at.steps
+    for k in range(at.steps, trace.speed_mps.size):
         speed_error = 0.0
         wheel_error = (0.0, 0.0, 0.0, 0.0)
         if noise.speed_mps.size > 0:
@@ -369,4 +392,7 @@ def _loop(
         row = row_of(k * dt_s, trace.speed_mps[k], pedals, decision_of(command), before, car, truth)
         for column in range(len(row)):
             series[k, column] = row[column]
-    return car
+        steps = k + 1
+        if estimated and controller.friction.assumed != assumed_friction:
+            break
+    return Progress(steps, car, controller, foot)

@@ -190,6 +190,7 @@ def drive_over_dds(plan: Plan, name: str) -> Outcome:
     vehicle_file = str(resolve(plan.vehicle).absolute())
     common = {"vehicle_file": vehicle_file, "idle_drive": plan.idle_drive, "lockstep": not plan.realtime}
     common |= {"rate_hz": plan.rate_hz, "friction": plan.friction}
+    told = {} if plan.scenario else {"friction_source": "parameter"}
     result = plan.output / "drive.npz"
     bag = plan.output / "bag"
     with (
@@ -212,6 +213,7 @@ def drive_over_dds(plan: Plan, name: str) -> Outcome:
                 "power_manager",
                 {
                     **common,
+                    **told,
                     "strategy": plan.strategy,
                     "policy_file": _absolute(plan.policy),
                     **{f"input_period_s.{topic}": 1.0 / plan.rate_hz for topic in _PERIODIC_INPUTS},

@@ -9,6 +9,7 @@ motors are released.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import NamedTuple
 
@@ -64,19 +65,22 @@ class RoadResult(NamedTuple):
 
 
 def controller_of(scenario: Scenario, settings: Settings | None = None, policies: str = "policies") -> Controller:
-    """The power manager as the node starts it, for the scenario's car and the friction it is told."""
+    """The power manager as the node starts it, for the scenario's car, with the friction it is told as its prior."""
     vehicle: Vehicle = scenario.vehicle
     params = vehicle.params
     thresholds = Thresholds()
-    settings = settings or default_settings()
+    prior = scenario.told_friction
+    settings = (settings or default_settings())._replace(friction_prior=prior)
     limits = ControllerLimits(
         inputs=input_limits(thresholds, params.front.wheel.radius_m, by_clock=True),
         age_s=AGES_S,
         supervision=supervision_limits(thresholds),
         actuators=actuator_limits(thresholds),
     )
-    table = PolicyBank(policies, (0.0, 0.5, 0.0, 0.5), vehicle).table(settings.strategy, scenario.told_friction)
-    return Controller(params, WHEELS, limits, settings, table, scenario.told_friction)
+    bank = PolicyBank(policies, (0.0, 0.5, 0.0, 0.5), vehicle)
+    controller = Controller(params, WHEELS, limits, settings, bank.table(settings.strategy, prior), prior)
+    controller.table_of = functools.partial(bank.table, settings.strategy)
+    return controller
 
 
 def give(controller: Controller, sensors: Sensors, drive: Drive, now_ns: int) -> None:

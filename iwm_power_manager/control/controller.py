@@ -8,6 +8,7 @@ this class as it is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from iwm_power_manager.control import law
@@ -73,6 +74,7 @@ class Controller:
     supervision : degraded state after the last step
     actuators : what is known of the motors
     settings, policy, friction : may be replaced between steps; torque follows through the law's own rate limits
+    table_of : the policy for a friction; with it, friction and policy follow the law's estimate (None: they stay)
     command : last command
     """
 
@@ -91,6 +93,7 @@ class Controller:
         self.settings = settings
         self.policy = policy
         self.friction = friction
+        self.table_of: Callable[[float], PolicyTable] | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -129,6 +132,7 @@ class Controller:
             passed_s = max(elapsed_s or dt_s, dt_s) if stale else dt_s
             self.supervision = supervise(self.supervision, stale, passed_s, self._limits.supervision)
         self._watch_motors(dt_s)
+        self._follow_estimate()
         measurement = self._measurement(dt_s)
         settings = self._settings()
         command, after = law.step(measurement, self.state, settings, self._vehicle, self.policy)
@@ -141,6 +145,15 @@ class Controller:
         self.command = command
         self.actuators = commanded(self.actuators, command.motor_torque_nm, dt_s, self._limits.actuators)
         return Step(command, values)
+
+    def _follow_estimate(self) -> None:
+        """The strategy assumes the friction that was estimated in the step before."""
+        if self.table_of is None:
+            return
+        friction = self.state.friction.assumed if self.state.steps else self.settings.friction_prior
+        if friction != self.friction:
+            self.friction = friction
+            self.policy = self.table_of(friction)
 
     def _watch_motors(self, dt_s: float) -> None:
         """Hold what the motors report against what they were told."""

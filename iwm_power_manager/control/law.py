@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from iwm_power_manager.control.friction import estimate as friction_estimate
 from iwm_power_manager.control.motion import Motion, estimate
 from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, GATE_MODE_TABLE2, Settings
 from iwm_power_manager.control.slew import slewed
@@ -48,7 +49,11 @@ from iwm_power_manager.control.types import (
     LIMIT_THERMAL,
     Command,
     ControllerState,
+    FrictionState,
     Measurement,
+    MotionState,
+    SplitMemory,
+    Wheels,
     WheelState,
 )
 from iwm_power_manager.jit import kernel
@@ -70,8 +75,10 @@ ROUNDING = 1e-12
 #: Speed of a braked wheel as part of the car's that is still believed when power becomes torque.
 FASTEST_BRAKED = 1.12
 
-#: Torques that have been unequal for longer than this are no passing bump, s.
+#: Torques that have been unequal for longer than this are no passing bump, s; and roads whose wheels can take torques
+#: that are less than this part apart are no two roads.
 UNEQUAL_S = 0.03
+UNEQUAL_PART = 0.2
 
 #: Below this speed, m/s, the car counts as standing: it is what wheels and car must both exceed to be rolling.
 MOVING_MPS = 0.06
@@ -171,6 +178,10 @@ def _wheel(
         gained = gained_radps(before, wheel_speed_radps, other_before, other_radps, radius)
         taken = road_torque_nm(before.total_nm, gained, dt_s, axle.wheel.inertia_kgm2)
         road = filtered(before.road_nm, taken, dt_s, settings.slip_filter_s)
+        if wheel_speed_radps == other_radps:
+            # One stands in for the other, which is not believed: nothing would ever tell their torques apart.
+            other_taken = road_torque_nm(other_before.total_nm, gained, dt_s, axle.wheel.inertia_kgm2)
+            road = 0.5 * (road + filtered(other_before.road_nm, other_taken, dt_s, settings.slip_filter_s))
     gated = False
     # The brakes have to be able to hold a car at rest: what is slip there, sensors cannot tell.
     if gate_mode != GATE_MODE_OFF and not (braking and speed_mps < settings.slip_speed_floor_mps):
@@ -225,8 +236,10 @@ def _rooms_nm(left: Wheel, right: Wheel, moment_nm: float, axle: Axle) -> tuple[
 
 @kernel
 def _unequal_s(before_s: float, left: Wheel, right: Wheel, unequal: bool, short: bool, dt_s: float) -> float:
-    """How long an axle's torques have been unequal, or would have been without a yaw budget."""
-    wanted = unequal or (short and _room_nm(left) != _room_nm(right))
+    """How long an axle's torques have been unequal by more than noise, or would have been without a yaw budget."""
+    left_room, right_room = _room_nm(left), _room_nm(right)
+    apart = abs(left_room - right_room) > UNEQUAL_PART * max(left_room, right_room)
+    wanted = apart and (unequal or short)
     return before_s + dt_s if wanted else max(before_s - dt_s, 0.0)
 
 
@@ -322,6 +335,111 @@ def _after(
     )
 
 
+class Pair(NamedTuple):
+    """The two wheels of an axle in one step, and what its yaw budget leaves each, N m."""
+
+    left: Wheel
+    right: Wheel
+    left_room_nm: float
+    right_room_nm: float
+
+
+class Shared(NamedTuple):
+    """What an axle's wheels are given, and the torques that were meant, N m >= 0."""
+
+    left: Given
+    right: Given
+    left_nm: float
+    right_nm: float
+
+
+@kernel
+def _yaw_moment_nm(now_nm: float, growth_nmps: float, most_nm: float, unequal_s: float, braking: bool) -> float:
+    """Yaw moment an axle's unequal torques may have.
+
+    Motors pull far less than brakes, and most at low speed: driving, all of it is there at once.
+    """
+    return min(now_nm + growth_nmps * unequal_s, most_nm) if braking else most_nm
+
+
+@kernel
+def _pair(
+    measurement: Measurement,
+    left_radps: float,
+    right_radps: float,
+    left_slip: float,
+    right_slip: float,
+    speed_mps: float,
+    left_gain: float,
+    right_gain: float,
+    lower_part: float,
+    gate_mode: int,
+    slip_target: float,
+    moment_nm: float,
+    first: bool,
+    left_before: WheelState,
+    right_before: WheelState,
+    axle: Axle,
+    settings: Settings,
+    vehicle: VehicleParams,
+) -> Pair:
+    """Steps 3 and 4 for an axle."""
+    demand, dt = measurement.power_demand_w, measurement.dt_s
+    left_gate, right_gate = left_slip, right_slip
+    if gate_mode == GATE_MODE_TABLE2:
+        left_gate = right_gate = worse_slip(left_slip, right_slip)
+    left = _wheel(
+        left_radps, left_slip, left_gate, speed_mps, demand, left_gain, lower_part, gate_mode, slip_target, dt, first,
+        left_before, right_radps, right_before, axle, settings, vehicle,
+    )  # fmt: skip
+    right = _wheel(
+        right_radps, right_slip, right_gate, speed_mps, demand, right_gain, lower_part, gate_mode, slip_target, dt,
+        first, right_before, left_radps, left_before, axle, settings, vehicle,
+    )  # fmt: skip
+    left_room, right_room = _rooms_nm(left, right, moment_nm, axle)
+    return Pair(left, right, left_room, right_room)
+
+
+@kernel
+def _pair_room_w(pair: Pair) -> float:
+    return pair.left.conversion_radps * pair.left_room_nm + pair.right.conversion_radps * pair.right_room_nm
+
+
+@kernel
+def _shared(
+    given_w: float,
+    pair: Pair,
+    speed_mps: float,
+    braking: bool,
+    dt_s: float,
+    left_before: WheelState,
+    right_before: WheelState,
+    settings: Settings,
+    axle: Axle,
+) -> Shared:
+    """Steps 5 and 6 for an axle."""
+    sign = -1.0 if braking else 1.0
+    left_nm, right_nm = between_wheels(
+        given_w, pair.left.conversion_radps, pair.right.conversion_radps, pair.left_room_nm, pair.right_room_nm
+    )
+    left = _given(sign * left_nm, pair.left, speed_mps, braking, dt_s, left_before, settings, axle)
+    right = _given(sign * right_nm, pair.right, speed_mps, braking, dt_s, right_before, settings, axle)
+    return Shared(left, right, left_nm, right_nm)
+
+
+@kernel
+def _pair_limits(pair: Pair, shared: Shared, short: bool, braking: bool, axle: Axle) -> int:
+    left = _limits(pair.left, shared.left, short or shared.left_nm < shared.right_nm, braking, axle)
+    return left | _limits(pair.right, shared.right, short or shared.right_nm < shared.left_nm, braking, axle)
+
+
+@kernel
+def _bits(front: Pair, rear: Pair) -> int:
+    """Bits of the wheels that are gated."""
+    front_bits = (1 if front.left.gated else 0) + (2 if front.right.gated else 0)
+    return front_bits + (4 if rear.left.gated else 0) + (8 if rear.right.gated else 0)
+
+
 @kernel
 def drive(
     measurement: Measurement,
@@ -341,22 +459,18 @@ def drive(
     slip_control : gate and slip limiter may act
     lower_part : a power that brakes is divided by this part of the speed (`motion.Motion`)
     """
-    front, rear = vehicle.front, vehicle.rear
     fl0, fr0, rl0, rr0 = state.wheels
     speed = max(measurement.speed_mps, 0.0)
-    demand = measurement.power_demand_w
     dt = measurement.dt_s
-    braking = demand < 0.0
+    braking = measurement.power_demand_w < 0.0
     first = state.steps == 0
-
-    gain = measurement.motor_gain
 
     # 1. slip, wheel by wheel; an axle's is that of its worse wheel
     w = measurement.wheel_speed_radps
-    fl_slip = _slip(w[0], speed, dt, first, fl0, front, settings)
-    fr_slip = _slip(w[1], speed, dt, first, fr0, front, settings)
-    rl_slip = _slip(w[2], speed, dt, first, rl0, rear, settings)
-    rr_slip = _slip(w[3], speed, dt, first, rr0, rear, settings)
+    fl_slip = _slip(w[0], speed, dt, first, fl0, vehicle.front, settings)
+    fr_slip = _slip(w[1], speed, dt, first, fr0, vehicle.front, settings)
+    rl_slip = _slip(w[2], speed, dt, first, rl0, vehicle.rear, settings)
+    rr_slip = _slip(w[3], speed, dt, first, rr0, vehicle.rear, settings)
     front_slip = worse_slip(fl_slip, fr_slip)
     rear_slip = worse_slip(rl_slip, rr_slip)
 
@@ -364,115 +478,115 @@ def drive(
     memory = split(measurement, speed, front_slip, rear_slip, first, state.split, settings, vehicle, policy)
 
     # 3. gate, 4. capacity
-    gate_mode = settings.gate_mode if slip_control else GATE_MODE_OFF
-    printed = gate_mode == GATE_MODE_TABLE2
-    # Unequal torques have to be steered against: the tyres must keep something to steer with.
-    unequal = braking and max(state.front_unequal_s, state.rear_unequal_s) > UNEQUAL_S
+    mode = settings.gate_mode if slip_control else GATE_MODE_OFF
+    # Unequal torques of the front wheels have to be steered against: the tyres must keep something to steer with.
+    unequal = braking and state.front_unequal_s > UNEQUAL_S
     target = min(settings.slip_target, settings.unequal_slip_target) if unequal else settings.slip_target
-    fl_gate, fr_gate = (front_slip, front_slip) if printed else (fl_slip, fr_slip)
-    rl_gate, rr_gate = (rear_slip, rear_slip) if printed else (rl_slip, rr_slip)
-    fl = _wheel(
-        w[0], fl_slip, fl_gate, speed, demand, gain[0], lower_part, gate_mode, target, dt, first, fl0, w[1], fr0,
-        front, settings, vehicle,
-    )  # fmt: skip
-    fr = _wheel(
-        w[1], fr_slip, fr_gate, speed, demand, gain[1], lower_part, gate_mode, target, dt, first, fr0, w[0], fl0,
-        front, settings, vehicle,
-    )  # fmt: skip
-    rl = _wheel(
-        w[2], rl_slip, rl_gate, speed, demand, gain[2], lower_part, gate_mode, target, dt, first, rl0, w[3], rr0,
-        rear, settings, vehicle,
-    )  # fmt: skip
-    rr = _wheel(
-        w[3], rr_slip, rr_gate, speed, demand, gain[3], lower_part, gate_mode, target, dt, first, rr0, w[2], rl0,
-        rear, settings, vehicle,
-    )  # fmt: skip
-    front_gated = fl.gated and fr.gated
-    rear_gated = rl.gated and rr.gated
-    front_moment = settings.front_yaw_nm + settings.front_yaw_growth_nmps * state.front_unequal_s
-    rear_moment = settings.rear_yaw_nm + settings.rear_yaw_growth_nmps * state.rear_unequal_s
-    # Motors pull far less than brakes, and most at low speed: driving, all of it is there at once.
-    front_moment = min(front_moment, settings.front_yaw_most_nm) if braking else settings.front_yaw_most_nm
-    rear_moment = min(rear_moment, settings.rear_yaw_most_nm) if braking else settings.rear_yaw_most_nm
-    fl_room, fr_room = _rooms_nm(fl, fr, front_moment, front)
-    rl_room, rr_room = _rooms_nm(rl, rr, rear_moment, rear)
-    front_power, rear_power = gated_split(demand, memory.applied_share, front_gated, rear_gated)
-    front_asked = abs(front_power)
-    rear_asked = abs(rear_power)
-    front_given, rear_given = allocate(
-        front_asked,
-        rear_asked,
-        fl.conversion_radps * fl_room + fr.conversion_radps * fr_room,
-        rl.conversion_radps * rl_room + rr.conversion_radps * rr_room,
+    s = settings
+    front_yaw = _yaw_moment_nm(
+        s.front_yaw_nm, s.front_yaw_growth_nmps, s.front_yaw_most_nm, state.front_unequal_s, braking
     )
+    rear_yaw = _yaw_moment_nm(s.rear_yaw_nm, s.rear_yaw_growth_nmps, s.rear_yaw_most_nm, state.rear_unequal_s, braking)
+    gain = measurement.motor_gain
+    front = _pair(
+        measurement, w[0], w[1], fl_slip, fr_slip, speed, gain[0], gain[1], lower_part, mode, target, front_yaw, first,
+        fl0, fr0, vehicle.front, settings, vehicle,
+    )  # fmt: skip
+    rear = _pair(
+        measurement, w[2], w[3], rl_slip, rr_slip, speed, gain[2], gain[3], lower_part, mode, target, rear_yaw, first,
+        rl0, rr0, vehicle.rear, settings, vehicle,
+    )  # fmt: skip
+    return _commanded(measurement, speed, front, rear, front_slip, rear_slip, memory, state, settings, vehicle)
+
+
+@kernel
+def _commanded(
+    measurement: Measurement,
+    speed_mps: float,
+    front: Pair,
+    rear: Pair,
+    front_slip: float,
+    rear_slip: float,
+    memory: SplitMemory,
+    state: ControllerState,
+    settings: Settings,
+    vehicle: VehicleParams,
+) -> tuple[Command, ControllerState]:
+    """Steps 4 to 7: from the power each axle is asked for to the torques that are commanded."""
+    demand, dt = measurement.power_demand_w, measurement.dt_s
+    braking = demand < 0.0
+    fl0, fr0, rl0, rr0 = state.wheels
+    front_gated = front.left.gated and front.right.gated
+    rear_gated = rear.left.gated and rear.right.gated
+    front_power, rear_power = gated_split(demand, memory.applied_share, front_gated, rear_gated)
+    front_asked, rear_asked = abs(front_power), abs(rear_power)
+    front_given, rear_given = allocate(front_asked, rear_asked, _pair_room_w(front), _pair_room_w(rear))
 
     # 5. torque, 6. slew
-    sign = -1.0 if braking else 1.0
-    fl_nm, fr_nm = between_wheels(front_given, fl.conversion_radps, fr.conversion_radps, fl_room, fr_room)
-    rl_nm, rr_nm = between_wheels(rear_given, rl.conversion_radps, rr.conversion_radps, rl_room, rr_room)
-    fl_given = _given(sign * fl_nm, fl, speed, braking, dt, fl0, settings, front)
-    fr_given = _given(sign * fr_nm, fr, speed, braking, dt, fr0, settings, front)
-    rl_given = _given(sign * rl_nm, rl, speed, braking, dt, rl0, settings, rear)
-    rr_given = _given(sign * rr_nm, rr, speed, braking, dt, rr0, settings, rear)
+    f = _shared(front_given, front, speed_mps, braking, dt, fl0, fr0, settings, vehicle.front)
+    r = _shared(rear_given, rear, speed_mps, braking, dt, rl0, rr0, settings, vehicle.rear)
     tolerance = ROUNDING * abs(demand)
     # Where both axles together fall short, each of them is at its limit, whatever its own part was.
     short = front_asked + rear_asked - front_given - rear_given > tolerance
     front_short = short or front_asked - front_given > tolerance
     rear_short = short or rear_asked - rear_given > tolerance
-    limits = (
-        _limits(fl, fl_given, front_short or fl_nm < fr_nm, braking, front)
-        | _limits(fr, fr_given, front_short or fr_nm < fl_nm, braking, front)
-        | _limits(rl, rl_given, rear_short or rl_nm < rr_nm, braking, rear)
-        | _limits(rr, rr_given, rear_short or rr_nm < rl_nm, braking, rear)
-    )
+    limits = _pair_limits(front, f, front_short, braking, vehicle.front)
+    limits |= _pair_limits(rear, r, rear_short, braking, vehicle.rear)
 
     # 7. battery
-    wanted = (fl_given.slewed_nm, fr_given.slewed_nm, rl_given.slewed_nm, rr_given.slewed_nm)
+    w = measurement.wheel_speed_radps
+    wanted = (f.left.slewed_nm, f.right.slewed_nm, r.left.slewed_nm, r.right.slewed_nm)
     scale = wheels_scale(wanted, w, measurement.discharge_limit_w, measurement.charge_limit_w, vehicle)
     if scale < 1.0:
         power = wheels_power_w(wanted, w, 1.0, vehicle)
         limits |= LIMIT_BATTERY_CHARGE if power < 0.0 else LIMIT_BATTERY_DISCHARGE
     motor = (scale * wanted[0], scale * wanted[1], scale * wanted[2], scale * wanted[3])
+    gain = measurement.motor_gain
     delivered = (gain[0] * motor[0], gain[1] * motor[1], gain[2] * motor[2], gain[3] * motor[3])
     friction = (
-        _friction_nm(fl_given, delivered[0], braking, front),
-        _friction_nm(fr_given, delivered[1], braking, front),
-        _friction_nm(rl_given, delivered[2], braking, rear),
-        _friction_nm(rr_given, delivered[3], braking, rear),
+        _friction_nm(f.left, delivered[0], braking, vehicle.front),
+        _friction_nm(f.right, delivered[1], braking, vehicle.front),
+        _friction_nm(r.left, delivered[2], braking, vehicle.rear),
+        _friction_nm(r.right, delivered[3], braking, vehicle.rear),
     )
     fl_nm, fr_nm = delivered[0] + friction[0], delivered[1] + friction[1]
     rl_nm, rr_nm = delivered[2] + friction[2], delivered[3] + friction[3]
-
+    gate = (1 if front_gated else 0) + (2 if rear_gated else 0)
     command = Command(
         motor_torque_nm=motor,
         friction_torque_nm=friction,
         front_share=memory.applied_share,
         decided_share=memory.decided_share,
-        gate=(1 if front_gated else 0) + (2 if rear_gated else 0),
+        gate=gate,
         limits=limits,
-        front_power_w=fl.conversion_radps * fl_nm + fr.conversion_radps * fr_nm,
-        rear_power_w=rl.conversion_radps * rl_nm + rr.conversion_radps * rr_nm,
+        front_power_w=front.left.conversion_radps * fl_nm + front.right.conversion_radps * fr_nm,
+        rear_power_w=rear.left.conversion_radps * rl_nm + rear.right.conversion_radps * rr_nm,
         front_slip=front_slip,
         rear_slip=rear_slip,
-        gated_wheels=(1 if fl.gated else 0) + (2 if fr.gated else 0) + (4 if rl.gated else 0) + (8 if rr.gated else 0),
+        gated_wheels=_bits(front, rear),
         speed_mps=measurement.speed_mps,
         doubted=0,
         hold_nm=0.0,
+        left_friction=0.0,
+        right_friction=0.0,
+        left_confidence=0.0,
+        right_confidence=0.0,
     )
     after = ControllerState(
         steps=state.steps + 1,
         split=memory,
         wheels=(
-            _after(fl, motor[0], friction[0], fl0, dt, front),
-            _after(fr, motor[1], friction[1], fr0, dt, front),
-            _after(rl, motor[2], friction[2], rl0, dt, rear),
-            _after(rr, motor[3], friction[3], rr0, dt, rear),
+            _after(front.left, motor[0], friction[0], fl0, dt, vehicle.front),
+            _after(front.right, motor[1], friction[1], fr0, dt, vehicle.front),
+            _after(rear.left, motor[2], friction[2], rl0, dt, vehicle.rear),
+            _after(rear.right, motor[3], friction[3], rr0, dt, vehicle.rear),
         ),
-        front_unequal_s=_unequal_s(state.front_unequal_s, fl, fr, fl_nm != fr_nm, front_short, dt),
-        rear_unequal_s=_unequal_s(state.rear_unequal_s, rl, rr, rl_nm != rr_nm, rear_short, dt),
+        front_unequal_s=_unequal_s(state.front_unequal_s, front.left, front.right, fl_nm != fr_nm, front_short, dt),
+        rear_unequal_s=_unequal_s(state.rear_unequal_s, rear.left, rear.right, rl_nm != rr_nm, rear_short, dt),
         motion=state.motion,
         travel=state.travel,
         hold_nm=state.hold_nm,
+        friction=state.friction,
     )
     return command, after
 
@@ -541,6 +655,76 @@ def _held(friction_nm: float, hold_nm: float, gated: bool, axle: Axle) -> float:
 
 
 @kernel
+def _turned_to(state: ControllerState, motion: MotionState, travel: float) -> ControllerState:
+    """What is remembered, in the direction of travel of this step, with what is known of the motion now."""
+    a, b, c, d = state.wheels
+    if travel != state.travel:
+        a, b, c, d = _turned(a), _turned(b), _turned(c), _turned(d)
+    return ControllerState(
+        steps=state.steps,
+        split=state.split,
+        wheels=(a, b, c, d),
+        front_unequal_s=state.front_unequal_s,
+        rear_unequal_s=state.rear_unequal_s,
+        motion=motion,
+        travel=travel,
+        hold_nm=state.hold_nm,
+        friction=state.friction,
+    )
+
+
+@kernel
+def _believed(measurement: Measurement, motion: Motion, travel: float, settings: Settings) -> Measurement:
+    """What is believed of a measurement, in the direction of travel; backwards, the car is driven no faster than so."""
+    m = measurement
+    demand = m.power_demand_w
+    if demand > 0.0 and m.direction < 0.0:
+        over = (settings.reverse_speed_mps + motion.speed_mps) / REVERSE_FADE_MPS
+        demand *= min(max(over, 0.0), 1.0)
+    w = motion.wheel_speed_radps
+    return Measurement(
+        travel * motion.speed_mps,
+        (travel * w[0], travel * w[1], travel * w[2], travel * w[3]),
+        demand,
+        m.dt_s,
+        m.friction,
+        m.discharge_limit_w,
+        m.charge_limit_w,
+        m.soc,
+        m.motor_gain,
+        m.direction,
+    )
+
+
+@kernel
+def _answered(
+    made: Command, friction_nm: Wheels, travel: float, motion: Motion, hold_nm: float, grip: FrictionState
+) -> Command:
+    """The command in the direction of the car, with what is known beside the torques."""
+    motor = made.motor_torque_nm
+    return Command(
+        motor_torque_nm=(travel * motor[0], travel * motor[1], travel * motor[2], travel * motor[3]),
+        friction_torque_nm=friction_nm,
+        front_share=made.front_share,
+        decided_share=made.decided_share,
+        gate=made.gate,
+        limits=made.limits,
+        front_power_w=made.front_power_w,
+        rear_power_w=made.rear_power_w,
+        front_slip=made.front_slip,
+        rear_slip=made.rear_slip,
+        gated_wheels=made.gated_wheels,
+        speed_mps=motion.speed_mps,
+        doubted=motion.doubted,
+        hold_nm=hold_nm,
+        left_friction=grip.left.friction,
+        right_friction=grip.right.friction,
+        left_confidence=grip.left.confidence,
+        right_confidence=grip.right.confidence,
+    )
+
+
+@kernel
 def step(
     measurement: Measurement,
     state: ControllerState,
@@ -562,43 +746,28 @@ def step(
     m = measurement
     motion, motion_after = estimate(m, state.motion, state.wheels, state.travel, state.steps == 0, vehicle)
     travel = _travel(motion.speed_mps, m.power_demand_w, m.direction, state.travel)
-    a, b, c, d = state.wheels
-    if travel != state.travel:
-        a, b, c, d = _turned(a), _turned(b), _turned(c), _turned(d)
-    before = ControllerState(
-        steps=state.steps,
-        split=state.split,
-        wheels=(a, b, c, d),
-        front_unequal_s=state.front_unequal_s,
-        rear_unequal_s=state.rear_unequal_s,
-        motion=motion_after,
-        travel=travel,
-        hold_nm=state.hold_nm,
-    )
-    demand = m.power_demand_w
-    if demand > 0.0 and m.direction < 0.0:
-        over = (settings.reverse_speed_mps + motion.speed_mps) / REVERSE_FADE_MPS
-        demand *= min(max(over, 0.0), 1.0)
-    w = motion.wheel_speed_radps
-    believed = Measurement(
-        travel * motion.speed_mps,
-        (travel * w[0], travel * w[1], travel * w[2], travel * w[3]),
-        demand,
+    before = _turned_to(state, motion_after, travel)
+    believed = _believed(m, motion, travel, settings)
+    grip = friction_estimate(
+        state.friction,
+        before.wheels,
+        believed.wheel_speed_radps,
+        believed.speed_mps,
+        motion.doubted == 0,
+        state.steps == 0,
         m.dt_s,
-        m.friction,
-        m.discharge_limit_w,
-        m.charge_limit_w,
-        m.soc,
-        m.motor_gain,
-        m.direction,
+        settings,
+        vehicle,
     )
+    demand = believed.power_demand_w
     # A car that rolls back is to be stopped, whatever its wheels do.
     slip_control = travel == m.direction or demand >= 0.0
     made, after = drive(believed, before, slip_control, motion.lower_part, settings, vehicle, policy)
     e, f, g, h = after.wheels
     motor = made.motor_torque_nm
     friction = made.friction_torque_nm
-    hold = _hold_nm(state.hold_nm, motion, m, motor[0] + motor[2], a.motor_nm + c.motor_nm, vehicle)
+    motor_before = before.wheels[0].motor_nm + before.wheels[2].motor_nm
+    hold = _hold_nm(state.hold_nm, motion, m, motor[0] + motor[2], motor_before, vehicle)
     if hold > 0.0 and demand >= 0.0:
         friction = (
             _held(friction[0], hold, e.gated, vehicle.front),
@@ -606,22 +775,6 @@ def step(
             _held(friction[2], hold, g.gated, vehicle.rear),
             _held(friction[3], hold, h.gated, vehicle.rear),
         )
-    command = Command(
-        motor_torque_nm=(travel * motor[0], travel * motor[1], travel * motor[2], travel * motor[3]),
-        friction_torque_nm=friction,
-        front_share=made.front_share,
-        decided_share=made.decided_share,
-        gate=made.gate,
-        limits=made.limits,
-        front_power_w=made.front_power_w,
-        rear_power_w=made.rear_power_w,
-        front_slip=made.front_slip,
-        rear_slip=made.rear_slip,
-        gated_wheels=made.gated_wheels,
-        speed_mps=motion.speed_mps,
-        doubted=motion.doubted,
-        hold_nm=hold,
-    )
     final = ControllerState(
         steps=after.steps,
         split=after.split,
@@ -631,5 +784,6 @@ def step(
         motion=motion_after,
         travel=travel,
         hold_nm=hold,
+        friction=grip,
     )
-    return command, final
+    return _answered(made, friction, travel, motion, hold, grip), final

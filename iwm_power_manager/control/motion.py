@@ -46,6 +46,7 @@ STUCK_S, STUCK_MPS = 0.05, 0.3
 #: is this far from them for this long is not believed.
 AGREE_PART, AGREE_MPS = 0.04, 0.3
 ROLLING_FRICTION = 0.08
+NEARLY_FRICTION = 0.15
 APART_PART, APART_MPS, APART_S = 0.05, 0.5, 0.1
 #: A sensor must have been near the reference for this long before it is believed again.
 DISTRUST_S = 0.5
@@ -59,6 +60,8 @@ STRAY_PART, STRAY_MPS = 0.1, 0.5
 GOOD_PART, GOOD_MPS = 0.08, 0.5
 #: A sensor and wheels that differ by no more than this may both be right: tyres, or a wrong radius.
 LEAST_PART = 0.72
+#: Wheels that are all wrong are believed to be so by one factor within this and its inverse.
+LEAST_FACTOR = 0.6
 #: No road force is larger than this part of the wheel's static load.
 MOST_FRICTION = 2.0
 #: Bits of `Motion.doubted`: the wheels in their order, then the speed sensor.
@@ -130,7 +133,8 @@ def _wheel_doubt(
             jumped = change < TORQUE_MARGIN * min(explained, rolling, 0.0) - JUMP_RADPS
         else:
             jumped = change > TORQUE_MARGIN * max(explained, rolling, 0.0) + JUMP_RADPS
-    free = abs(torque_nm) < FREE_PART * load_nm
+    # Nothing holds a wheel that is free, nor one that is braked and yet faster than the car.
+    free = abs(torque_nm) < FREE_PART * load_nm or direction * torque_nm * level < 0.0
     away = abs(level) > STRAY_PART * size + STRAY_MPS
     if free and away and (-change if level > 0.0 else change) < ICE_FRICTION * load_nm / inertia * dt_s:
         stray_s += dt_s
@@ -145,18 +149,21 @@ def _wheel_doubt(
 
 
 class _Rolling(NamedTuple):
-    """What the wheels that are believed say: how many, their rim speeds' extremes and mean, and whether they roll."""
+    """What the wheels that are believed say: how many, their rim speeds' extremes and mean, and whether they roll.
+
+    `freely` is without slip that would show; `nearly` is with less than makes a wrong speed of it.
+    """
 
     believed: int
     low_mps: float
     high_mps: float
     mean_mps: float
     freely: bool
+    nearly: bool
 
 
 @kernel
-def _rolling(rims: Wheels, doubt_s: Wheels, road: Wheels, front_nm: float, rear_nm: float) -> _Rolling:
-    """`front_nm`, `rear_nm` : road torque below which a wheel rolls freely."""
+def _rolling(rims: Wheels, doubt_s: Wheels, turning: _Turning) -> _Rolling:
     count = 0
     low = math.inf
     high = -math.inf
@@ -167,9 +174,12 @@ def _rolling(rims: Wheels, doubt_s: Wheels, road: Wheels, front_nm: float, rear_
             low = min(low, rims[i])
             high = max(high, rims[i])
             total += rims[i]
-    calm = max(abs(road[0]), abs(road[1])) < front_nm and max(abs(road[2]), abs(road[3])) < rear_nm
+    road = turning.road_nm
+    front_used = max(abs(road[0]), abs(road[1])) / turning.front_nm
+    used = max(front_used, max(abs(road[2]), abs(road[3])) / turning.rear_nm)
     agree = count >= 3 and high - low <= AGREE_PART * abs(high) + AGREE_MPS
-    return _Rolling(count, low, high, total / max(count, 1), calm and agree)
+    mean = total / max(count, 1)
+    return _Rolling(count, low, high, mean, agree and used < ROLLING_FRICTION, agree and used < NEARLY_FRICTION)
 
 
 class _Sensor(NamedTuple):
@@ -232,6 +242,8 @@ def _pulled(
             if not trusted:
                 pull = SLOW_PULL_MPS2 if slow else WHEEL_PULL_MPS2 + PULL_OF_FORCES * abs(forces)
             reference += _clamped(error, pull * dt)
+        elif not trusted and rolling.nearly:
+            reference += _clamped(error, PULL_MPS2 * dt)
     return reference
 
 
@@ -260,6 +272,113 @@ def _started(shown: float, rims: Wheels) -> MotionState:
     return MotionState(start, 0.0, shown, 0.0, 0.0, 0.0, 0.0, NO_WHEELS, NO_WHEELS)
 
 
+class _Turning(NamedTuple):
+    """The wheels since the last step, signed as the car is: torque, gain of speed, what the road took; of their loads.
+
+    Attributes
+    ----------
+    torque_nm, change_radps, road_nm : of each wheel
+    front_nm, rear_nm : load times radius, the torque of a road of friction 1
+    """
+
+    torque_nm: Wheels
+    change_radps: Wheels
+    road_nm: Wheels
+    front_nm: float
+    rear_nm: float
+
+
+@kernel
+def _turning(
+    w: Wheels,
+    wheels: tuple[WheelState, WheelState, WheelState, WheelState],
+    travel: float,
+    first: bool,
+    dt: float,
+    doubt_s: Wheels,
+    vehicle: VehicleParams,
+) -> _Turning:
+    chassis = vehicle.chassis
+    front, rear = vehicle.front.wheel, vehicle.rear.wheel
+    weight = chassis.mass_kg * GRAVITY_MPS2 / (chassis.front_axle_to_cg_m + chassis.rear_axle_to_cg_m)
+    front_nm = 0.5 * weight * chassis.rear_axle_to_cg_m * front.radius_m
+    rear_nm = 0.5 * weight * chassis.front_axle_to_cg_m * rear.radius_m
+    a, b, c, d = wheels
+    torque = (travel * a.total_nm, travel * b.total_nm, travel * c.total_nm, travel * d.total_nm)
+    change = NO_WHEELS
+    if not first:
+        change = (
+            w[0] - travel * a.speed_radps,
+            w[1] - travel * b.speed_radps,
+            w[2] - travel * c.speed_radps,
+            w[3] - travel * d.speed_radps,
+        )
+    road = (
+        _road_nm(torque[0], change[0], dt, doubt_s[0] > 0.0, front.inertia_kgm2, front_nm),
+        _road_nm(torque[1], change[1], dt, doubt_s[1] > 0.0, front.inertia_kgm2, front_nm),
+        _road_nm(torque[2], change[2], dt, doubt_s[2] > 0.0, rear.inertia_kgm2, rear_nm),
+        _road_nm(torque[3], change[3], dt, doubt_s[3] > 0.0, rear.inertia_kgm2, rear_nm),
+    )
+    return _Turning(torque, change, road, front_nm, rear_nm)
+
+
+@kernel
+def _doubts(
+    w: Wheels,
+    t: _Turning,
+    predicted: float,
+    acceleration: float,
+    dt: float,
+    stray: Wheels,
+    old: Wheels,
+    vehicle: VehicleParams,
+) -> tuple[Wheels, Wheels]:
+    """How long each wheel has stayed away by now, and the time it has yet to be good."""
+    front, rear = vehicle.front.wheel, vehicle.rear.wheel
+    torque, change = t.torque_nm, t.change_radps
+    s0, d0 = _wheel_doubt(w[0], change[0], torque[0], predicted, acceleration, dt, stray[0], old[0], front, t.front_nm)
+    s1, d1 = _wheel_doubt(w[1], change[1], torque[1], predicted, acceleration, dt, stray[1], old[1], front, t.front_nm)
+    s2, d2 = _wheel_doubt(w[2], change[2], torque[2], predicted, acceleration, dt, stray[2], old[2], rear, t.rear_nm)
+    s3, d3 = _wheel_doubt(w[3], change[3], torque[3], predicted, acceleration, dt, stray[3], old[3], rear, t.rear_nm)
+    return (s0, s1, s2, s3), (d0, d1, d2, d3)
+
+
+@kernel
+def _used_wheels(
+    w: Wheels, rims: Wheels, doubt: Wheels, used_mps: float, believed: int, demand_w: float, vehicle: VehicleParams
+) -> Wheels:
+    """Wheel speeds to use.
+
+    Where none is believed, all of them may be wrong by one factor: the one that slips least is taken as rolling, and
+    the others tell their slip beside it.
+    """
+    front, rear = vehicle.front.wheel.radius_m, vehicle.rear.wheel.radius_m
+    if believed == 0:
+        sign = 1.0 if used_mps >= 0.0 else -1.0
+        a, b, c, d = sign * rims[0], sign * rims[1], sign * rims[2], sign * rims[3]
+        best = max(a, b, c, d) if demand_w < 0.0 else min(a, b, c, d)
+        factor = abs(used_mps) / best if best > 0.0 else 0.0
+        if LEAST_FACTOR < factor < 1.0 / LEAST_FACTOR:
+            return (factor * w[0], factor * w[1], factor * w[2], factor * w[3])
+    return (
+        _used(w[0], doubt[0], w[1], doubt[1], used_mps / front),
+        _used(w[1], doubt[1], w[0], doubt[0], used_mps / front),
+        _used(w[2], doubt[2], w[3], doubt[3], used_mps / rear),
+        _used(w[3], doubt[3], w[2], doubt[2], used_mps / rear),
+    )
+
+
+@kernel
+def _bias_mps2(before: float, shown: float, predicted: float, trusted: bool, rolling: _Rolling, dt: float) -> float:
+    """What the forces do not explain of a speed that is believed."""
+    if not (trusted and abs(predicted) > SLOW_MPS):
+        return before
+    confirmed = abs(shown - rolling.mean_mps) <= CONFIRMED_PART * abs(shown) + CONFIRMED_MPS
+    gain = CONFIRMED_GAIN_PER_S2 if confirmed and rolling.believed >= 3 else BIAS_GAIN_PER_S2
+    step = gain * _clamped(shown - predicted, BIAS_STEP_MPS) * dt
+    return _clamped(before + step, BIAS_MPS2)
+
+
 @kernel
 def estimate(
     measurement: Measurement,
@@ -282,55 +401,22 @@ def estimate(
     shown = measurement.speed_mps
     w = measurement.wheel_speed_radps
     dt = measurement.dt_s
-    chassis = vehicle.chassis
-    front, rear = vehicle.front.wheel, vehicle.rear.wheel
-    weight = chassis.mass_kg * GRAVITY_MPS2 / (chassis.front_axle_to_cg_m + chassis.rear_axle_to_cg_m)
-    # Load of a wheel times its radius: the torque of a road of friction 1.
-    front_nm = 0.5 * weight * chassis.rear_axle_to_cg_m * front.radius_m
-    rear_nm = 0.5 * weight * chassis.front_axle_to_cg_m * rear.radius_m
-    rims = (w[0] * front.radius_m, w[1] * front.radius_m, w[2] * rear.radius_m, w[3] * rear.radius_m)
+    front, rear = vehicle.front.wheel.radius_m, vehicle.rear.wheel.radius_m
+    rims = (w[0] * front, w[1] * front, w[2] * rear, w[3] * rear)
     if first:
         before = _started(shown, rims)
-    a, b, c, d = wheels
-    torque = (travel * a.total_nm, travel * b.total_nm, travel * c.total_nm, travel * d.total_nm)
-    change = NO_WHEELS
-    if not first:
-        change = (
-            w[0] - travel * a.speed_radps,
-            w[1] - travel * b.speed_radps,
-            w[2] - travel * c.speed_radps,
-            w[3] - travel * d.speed_radps,
-        )
-    old = before.wheel_doubt_s
-    road = (
-        _road_nm(torque[0], change[0], dt, old[0] > 0.0, front.inertia_kgm2, front_nm),
-        _road_nm(torque[1], change[1], dt, old[1] > 0.0, front.inertia_kgm2, front_nm),
-        _road_nm(torque[2], change[2], dt, old[2] > 0.0, rear.inertia_kgm2, rear_nm),
-        _road_nm(torque[3], change[3], dt, old[3] > 0.0, rear.inertia_kgm2, rear_nm),
-    )
-    forces = _forces_mps2(road, vehicle)
+    turning = _turning(w, wheels, travel, first, dt, before.wheel_doubt_s, vehicle)
+    forces = _forces_mps2(turning.road_nm, vehicle)
     acceleration = 0.0
     if abs(before.speed_mps) > SLOW_MPS and not first:
         acceleration = forces - _resistance_mps2(before.speed_mps, vehicle) + before.bias_mps2
     predicted = before.speed_mps + acceleration * dt
-
-    stray = before.wheel_stray_s
-    s0, d0 = _wheel_doubt(w[0], change[0], torque[0], predicted, acceleration, dt, stray[0], old[0], front, front_nm)
-    s1, d1 = _wheel_doubt(w[1], change[1], torque[1], predicted, acceleration, dt, stray[1], old[1], front, front_nm)
-    s2, d2 = _wheel_doubt(w[2], change[2], torque[2], predicted, acceleration, dt, stray[2], old[2], rear, rear_nm)
-    s3, d3 = _wheel_doubt(w[3], change[3], torque[3], predicted, acceleration, dt, stray[3], old[3], rear, rear_nm)
-    doubt = (d0, d1, d2, d3)
-    rolling = _rolling(rims, doubt, road, ROLLING_FRICTION * front_nm, ROLLING_FRICTION * rear_nm)
+    stray, doubt = _doubts(w, turning, predicted, acceleration, dt, before.wheel_stray_s, before.wheel_doubt_s, vehicle)
+    rolling = _rolling(rims, doubt, turning)
     sensor = _judge_speed(shown, predicted, acceleration, dt, before, rolling)
     trusted = not math.isnan(shown) and sensor.doubt_s == 0.0
-    reference = _pulled(sensor.predicted_mps, shown, trusted, rolling, measurement.power_demand_w, forces, dt)
-    bias = before.bias_mps2
-    if trusted and abs(sensor.predicted_mps) > SLOW_MPS:
-        confirmed = abs(shown - rolling.mean_mps) <= CONFIRMED_PART * abs(shown) + CONFIRMED_MPS
-        gain = CONFIRMED_GAIN_PER_S2 if confirmed and rolling.believed >= 3 else BIAS_GAIN_PER_S2
-        step = gain * _clamped(shown - sensor.predicted_mps, BIAS_STEP_MPS) * dt
-        bias = _clamped(bias + step, BIAS_MPS2)
-
+    demand = measurement.power_demand_w
+    reference = _pulled(sensor.predicted_mps, shown, trusted, rolling, demand, forces, dt)
     used = shown if trusted else reference
     part = 1.0
     if not (trusted or math.isnan(shown)) and abs(reference) > SLOW_MPS:
@@ -344,24 +430,19 @@ def estimate(
     motion = Motion(
         speed_mps=used,
         uncertainty_mps=0.1 + SPEED_PART * abs(used) if trusted else SPEED_MPS + 2.0 * WHEEL_PART * abs(used),
-        wheel_speed_radps=(
-            _used(w[0], d0, w[1], d1, used / front.radius_m),
-            _used(w[1], d1, w[0], d0, used / front.radius_m),
-            _used(w[2], d2, w[3], d3, used / rear.radius_m),
-            _used(w[3], d3, w[2], d2, used / rear.radius_m),
-        ),
+        wheel_speed_radps=_used_wheels(w, rims, doubt, used, rolling.believed, demand, vehicle),
         lower_part=part,
         doubted=doubted,
     )
     after = MotionState(
         speed_mps=reference,
-        bias_mps2=bias,
+        bias_mps2=_bias_mps2(before.bias_mps2, shown, sensor.predicted_mps, trusted, rolling, dt),
         shown_mps=shown,
         shown_s=sensor.shown_s,
         moved_mps=sensor.moved_mps,
         apart_s=sensor.apart_s,
         doubt_s=sensor.doubt_s,
-        wheel_stray_s=(s0, s1, s2, s3),
+        wheel_stray_s=stray,
         wheel_doubt_s=doubt,
     )
     return motion, after

@@ -58,6 +58,10 @@ _COMMAND = (
     Signal("estimated_speed_mps", "speed of the car as estimated, negative backwards"),
     Signal("doubted", "bits of the sensors that are not believed: 1, 2, 4, 8 the wheels, 16 vehicle_speed"),
     Signal("hold_nm", "friction torque of each wheel that holds the car on a slope"),
+    Signal("left_friction", "peak friction of the road under the left wheels, as estimated"),
+    Signal("right_friction", "peak friction of the road under the right wheels, as estimated"),
+    Signal("left_friction_confidence", "how well it is known: 0 is the prior, 1 is felt"),
+    Signal("right_friction_confidence", "how well it is known: 0 is the prior, 1 is felt"),
 )
 _CONTROLLER = (
     Signal("step", "steps since the law's initial state; 0 is the first"),
@@ -125,9 +129,12 @@ def to_numbers(
 
 
 #: What a record that is older than a signal would have said.
-YOUNGER_SIGNALS = {"gated_wheels": 0.0, "doubted": 0.0, "hold_nm": 0.0, "direction": 1.0} | {
-    f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES
-}
+YOUNGER_SIGNALS = (
+    {"gated_wheels": 0.0, "doubted": 0.0, "hold_nm": 0.0, "direction": 1.0}
+    | {f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES}
+    | {f"{side}_friction": 0.0 for side in ("left", "right")}
+    | {f"{side}_friction_confidence": 0.0 for side in ("left", "right")}
+)
 
 #: The signals the law decides.
 DECIDED_NAMES = tuple(signal.name for signal in (*_COMMAND, *_CONTROLLER))

@@ -120,6 +120,20 @@ class Settings(NamedTuple):
     ] = 0.0
     rear_yaw_growth_nmps: Annotated[float, Setting("growth of it while it is used", "N m/s", 0.0, 1e6)] = 0.0
     rear_yaw_most_nm: Annotated[float, Setting("what it grows to", "N m", 0.0, 1e5)] = 0.0
+    # Dry asphalt: where nothing is felt of the road, nothing is near its limit, and on a road of less the first wheels
+    # to slip tell it within a tenth of a second.
+    friction_prior: Annotated[
+        float, Setting("peak friction of a road of which nothing is known yet, or any more", "", 0.05, 1.5)
+    ] = 0.9
+    # A mile of town.
+    friction_memory_s: Annotated[
+        float, Setting("time over which rolling wheels are listened to for the friction", "s", 0.5, 600.0)
+    ] = 10.0
+    friction_return_s: Annotated[
+        float, Setting("time in which an estimated friction goes back to the prior", "s", 1.0, 3600.0)
+    ] = 60.0
+    # From ice to asphalt in 0.35 s; one wrong point of a slipping wheel raises it by 0.02.
+    friction_rise_per_s: Annotated[float, Setting("fastest growth of the estimated friction", "1/s", 0.01, 100.0)] = 2.0
     reverse_speed_mps: Annotated[float, Setting("fastest reverse the motors drive to", "m/s", 0.5, 20.0)] = 5.0
     # From rest to the peak torque in 0.125 s; from there to zero in one step of 10 ms (gates and limits may be faster);
     # to full regeneration in 0.02 s.

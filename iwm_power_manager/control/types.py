@@ -88,6 +88,8 @@ class Command(NamedTuple):
     speed_mps : speed of the car as estimated, negative backwards
     doubted : bits of the sensors that are not believed: 1, 2, 4, 8 the wheels, 16 the vehicle speed
     hold_nm : friction torque of each wheel that keeps the car from rolling against the direction asked for, >= 0
+    left_friction, right_friction : peak friction of the road as estimated under the wheels of either side
+    left_confidence, right_confidence : how well it is known, 0 (the prior) to 1
     """
 
     motor_torque_nm: Wheels
@@ -104,6 +106,10 @@ class Command(NamedTuple):
     speed_mps: float
     doubted: int
     hold_nm: float
+    left_friction: float
+    right_friction: float
+    left_confidence: float
+    right_confidence: float
 
 
 class WheelState(NamedTuple):
@@ -174,6 +180,52 @@ class MotionState(NamedTuple):
     wheel_doubt_s: Wheels
 
 
+class WheelGrip(NamedTuple):
+    """What `control.friction` remembers of one wheel; torques and forces as parts of the wheel's load.
+
+    Attributes
+    ----------
+    slip, used : its slip and the road's force, averaged over a few steps
+    weight : of the points of its regression
+    torque, road, curve : their means: applied torque, force of the road, tyre curve at the slip
+    torque_torque, torque_road, torque_curve, curve_curve : sums of products of what they differ from their means
+    """
+
+    slip: float
+    used: float
+    weight: float
+    torque: float
+    road: float
+    curve: float
+    torque_torque: float
+    torque_road: float
+    torque_curve: float
+    curve_curve: float
+
+
+class SideGrip(NamedTuple):
+    """Peak friction of the road under the wheels of one side, and how well it is known, 0 (the prior) to 1."""
+
+    friction: float
+    confidence: float
+
+
+class FrictionState(NamedTuple):
+    """What `control.friction` remembers from step to step.
+
+    Attributes
+    ----------
+    left, right : the estimate
+    wheels : what each wheel has told
+    assumed : friction the strategy is to assume: of the lower side, in steps
+    """
+
+    left: SideGrip
+    right: SideGrip
+    wheels: tuple[WheelGrip, WheelGrip, WheelGrip, WheelGrip]
+    assumed: float
+
+
 class ControllerState(NamedTuple):
     """What the law remembers from one step to the next; `initial_state` makes the first one.
 
@@ -187,6 +239,7 @@ class ControllerState(NamedTuple):
     motion : of the estimate of speed and direction
     travel : direction of travel the torques and speeds of `wheels` are reckoned in: 1 forwards, -1 backwards
     hold_nm : friction torque of each wheel that holds the car on a slope
+    friction : of the estimate of the road's friction
     """
 
     steps: int
@@ -197,12 +250,26 @@ class ControllerState(NamedTuple):
     motion: MotionState
     travel: float
     hold_nm: float
+    friction: FrictionState
 
 
 def initial_state() -> ControllerState:
     """The law's memory before its first step: at rest, cold, power split equally, all sensors believed."""
     wheel = WheelState(motor_nm=0.0, total_nm=0.0, speed_radps=0.0, road_nm=0.0, slip=0.0, gated=False, heat=0.0)
     none = (0.0, 0.0, 0.0, 0.0)
+    grip = WheelGrip(
+        slip=0.0,
+        used=0.0,
+        weight=0.0,
+        torque=0.0,
+        road=0.0,
+        curve=0.0,
+        torque_torque=0.0,
+        torque_road=0.0,
+        torque_curve=0.0,
+        curve_curve=0.0,
+    )
+    side = SideGrip(friction=0.9, confidence=0.0)
     split = SplitMemory(
         decisions=0, age_s=0.0, decided_share=0.5, applied_share=0.5, changes_used=0.0, jitter=no_jitter()
     )
@@ -225,4 +292,5 @@ def initial_state() -> ControllerState:
         ),
         travel=1.0,
         hold_nm=0.0,
+        friction=FrictionState(left=side, right=side, wheels=(grip, grip, grip, grip), assumed=side.friction),
     )

@@ -554,9 +554,13 @@ class PowerManager(KeepsItsValues, LifecycleNode):
     def _choose_friction(self) -> None:
         assert self._controller is not None
         assert self._policies is not None
+        source = self._values["friction_source"]
+        self._controller.table_of = self._policies.table if source == config.ESTIMATED else None
+        if source == config.ESTIMATED:
+            return
         friction: float = self._values["friction"]
         monitor = self._controller.monitor
-        if self._values["friction_source"] == messages.ROAD_FRICTION:
+        if source == config.TOPIC:
             age_s = monitor.tallies[messages.ROAD_FRICTION].age_s(self._now_ns())
             if age_s <= self._values["friction_timeout_s"]:
                 friction = monitor.friction

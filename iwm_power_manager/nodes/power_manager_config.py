@@ -13,6 +13,9 @@ from iwm_power_manager.ros import messages
 from iwm_power_manager.ros.parameters import Spec, yaml_text
 from iwm_power_manager.signals.mapping import DEFAULT_MAPPING
 
+#: Values of `friction_source` beside "parameter".
+ESTIMATED, TOPIC = "estimated", "topic"
+
 
 def _specs(table: Mapping[str, settings.Setting], defaults: Mapping[str, Any], about: str = "") -> list[Spec]:
     """A parameter for each row of one of the law's tables."""
@@ -82,12 +85,20 @@ SPECS = (
         length=4,
     ),
     *_specs(settings.TABLE, settings.DEFAULTS._asdict(), "Control law: "),
-    Spec("friction", 0.9, "Peak friction coefficient the strategy assumes.", 0.05, 1.5, change=Change.ALWAYS),
+    Spec(
+        "friction",
+        0.9,
+        "Peak friction coefficient the strategy assumes, with friction_source parameter.",
+        0.05,
+        1.5,
+        change=Change.ALWAYS,
+    ),
     Spec(
         "friction_source",
-        "parameter",
-        "Where the friction comes from; road_friction falls back to the parameter when its topic is stale.",
-        choices=("parameter", "road_friction"),
+        ESTIMATED,
+        "Where the friction that the strategy assumes comes from: estimated from slip and road force; topic "
+        "(road_friction, and the parameter when that is stale); parameter.",
+        choices=(ESTIMATED, TOPIC, "parameter"),
         change=Change.ALWAYS,
     ),
     Spec("friction_timeout_s", 2.0, "Age at which road_friction is stale, s.", 0.01, 3600.0, change=Change.ALWAYS),

@@ -72,10 +72,11 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
         actuator_limits(thresholds),
     )
     names = tuple(values["wheel_names"])
-    table = policies.table(values["friction"])
-    controller = Controller(
-        vehicle.params, names, limits, config.law_settings(values, policies.strategy), table, values["friction"]
-    )
+    settings = config.law_settings(values, policies.strategy)
+    estimated = values["friction_source"] == config.ESTIMATED
+    friction = settings.friction_prior if estimated else values["friction"]
+    table = policies.table(friction)
+    controller = Controller(vehicle.params, names, limits, settings, table, friction)
     mapping = load_mapping(resolve(values["signals_file"]))
     if values["signals_file"] == DEFAULT_MAPPING:
         mapping = mapping.with_wheel_names(names)
@@ -85,6 +86,7 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
         controller.policy = warmed
         controller.step(0, 1.0 / values["rate_hz"])
     controller.policy = table
+    controller.table_of = policies.table if estimated else None
     controller.reset()
     elapsed_s = time.monotonic() - started_s
     return Prepared(values, vehicle, policies, controller, mapping, readers, commands, elapsed_s)

@@ -67,7 +67,7 @@ class PolicyBank:
         self._rule = tuple(rule)
         self._vehicle = vehicle
         self._bank: list[Policy] | None = None
-        self._tables: dict[float, PolicyTable] = {}
+        self._tables: dict[str, PolicyTable] = {}
         self._empty = empty_table(rule=self._rule)
 
     def table(self, strategy: int, friction: float) -> PolicyTable:
@@ -80,10 +80,10 @@ class PolicyBank:
         """
         if not STRATEGIES[name_of(strategy)].needs_policy:
             return self._empty
-        if friction not in self._tables:
-            policy = choose(self._loaded(), friction)
-            self._tables[friction] = policy.table(self._rule)
-        return self._tables[friction]
+        policy = choose(self._loaded(), friction)
+        if policy.checksum not in self._tables:
+            self._tables[policy.checksum] = policy.table(self._rule)
+        return self._tables[policy.checksum]
 
     @property
     def checksums(self) -> list[str]:

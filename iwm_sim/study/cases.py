@@ -26,6 +26,7 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.policy import Policy, load_policy
+from iwm_power_manager.replay.plan import PolicyBank
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle, load_vehicle, with_params
 from iwm_sim import closed_loop, preview
@@ -84,6 +85,7 @@ class Case:
     dt_s, substeps : control step, plant steps in it
     soc : at the start
     assumed_friction : what the law is told; None is the truth
+    policies : folder or file of policies over friction; with it, the law is told the friction it has estimated
     noise : of the sensors
     car : changes of the car, known to driver and law
     plant : changes of the car nobody knows of
@@ -106,6 +108,7 @@ class Case:
     substeps: int = 1
     soc: float = 0.8
     assumed_friction: float | None = None
+    policies: str = ""
     noise: SensorNoise = NO_NOISE
     car: tuple[Change, ...] = ()
     plant: tuple[Change, ...] = ()
@@ -199,11 +202,14 @@ def drive(case: Case, until_s: float = np.inf) -> Run:
     cycle = cycle_of(case.cycle)
     vehicle = vehicle_of(case.vehicle, case.idle_drive, case.car)
     settings = case.settings._replace(strategy=STRATEGIES[case.strategy].code)
+    table_of = None
+    if case.policies:
+        table_of = functools.partial(PolicyBank(case.policies, case.rule, vehicle).table, settings.strategy)
     return closed_loop.run(
         cycle,
         vehicle,
         settings,
-        _policy_table(case, vehicle, until_s),
+        empty_table() if table_of else _policy_table(case, vehicle, until_s),
         case.friction,
         assumed_friction=case.assumed_friction,
         dt_s=case.dt_s,
@@ -212,6 +218,7 @@ def drive(case: Case, until_s: float = np.inf) -> Run:
         until_s=until_s,
         noise=_noise(case.noise, cycle, case.dt_s),
         plant_vehicle=vehicle_of(case.vehicle, case.idle_drive, case.car + case.plant) if case.plant else None,
+        table_of=table_of,
     )
 
 

@@ -150,6 +150,13 @@ def _add_law(group: argparse._ArgumentGroup) -> None:
         metavar="MU",
         help="friction the law is told (default: the road's)",
     )
+    group.add_argument(
+        "--friction-source",
+        choices=("parameter", "estimated"),
+        default="parameter",
+        help="estimated: the law estimates the friction from friction_prior on, and its policy is picked by it, as in "
+        "the node (default: it is told)",
+    )
 
 
 def _add_simulation(group: argparse._ArgumentGroup) -> None:

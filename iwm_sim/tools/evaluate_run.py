@@ -131,6 +131,8 @@ def _with_policy(
 ) -> Case:
     if name in VARIANTS:
         return dataclasses.replace(case, policy=policies.of_variant(name, case.idle_drive, case.told_friction))
+    if name in POLICY_STRATEGIES and options.friction_source == "estimated":
+        return dataclasses.replace(case, policies=options.policy, label=f"{name}, friction estimated")
     if name in POLICY_STRATEGIES:
         return dataclasses.replace(case, policy=find(case.idle_drive, case.told_friction))
     if name != "preview":

@@ -44,6 +44,10 @@ def command(motor=(0.0,) * 4, friction=(0.0,) * 4, gated_wheels=0, gate=None) ->
         speed_mps=0.0,
         doubted=0,
         hold_nm=0.0,
+        left_friction=0.9,
+        right_friction=0.9,
+        left_confidence=0.0,
+        right_confidence=0.0,
     )
 
 

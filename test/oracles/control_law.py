@@ -49,7 +49,7 @@ def grip(braking, road, wheel, speed, settings, axle):
 
 def slip_target(state, settings, braking):
     """Slip the limiter steers to: less while left and right are braked unequally."""
-    unequal = braking and max(state.front_unequal_s, state.rear_unequal_s) > 0.03
+    unequal = braking and state.front_unequal_s > 0.03
     return min(settings.slip_target, settings.unequal_slip_target) if unequal else settings.slip_target
 
 
@@ -169,8 +169,14 @@ def step(m, state, settings, vehicle, decide):
             change = (wheel.speed - wheel.before.speed_radps) / m.dt_s
             if alike:  # the mean of both says it better
                 change = 0.5 * (change + (other.speed - other.before.speed_radps) / m.dt_s)
-            taken = wheel.before.total_nm - wheel.axle.wheel.inertia_kgm2 * change
-            wheel.road = low_pass(wheel.before.road_nm, taken, m.dt_s, settings.slip_filter_s)
+            # Wheels of one speed to the last bit: one stands in for the other, and the road is the mean of both.
+            both = [wheel, other] if wheel.speed == other.speed else [wheel]
+            taken = [one.before.total_nm - wheel.axle.wheel.inertia_kgm2 * change for one in both]
+            roads = [
+                low_pass(one.before.road_nm, t, m.dt_s, settings.slip_filter_s)
+                for one, t in zip(both, taken, strict=True)
+            ]
+            wheel.road = sum(roads) / len(roads)
 
     memory = state.split
     decided = memory.decided_share

@@ -254,6 +254,7 @@ class TestParameters:
         bench.drive(lambda: bench.last("front_left_motor_torque_nm") > 40.0, "torque")
         start = len(bench.states)
         assert bench.set_parameter("strategy", "rule") == ""
+        assert bench.set_parameter("friction_source", "parameter") == ""
         assert bench.set_parameter("friction", 0.4) == ""
         bench.drive(lambda: bench.last("setting.strategy") == 1 and bench.last("friction") == 0.4, "the change")
         bench.drive(lambda: bench.last("front_share") == pytest.approx(0.9), "another split")
@@ -278,7 +279,7 @@ class TestParameters:
 
 def test_friction_may_come_from_its_topic_and_falls_back_when_that_is_stale(bench) -> None:
     assert bench.set_parameter("friction", 0.9) == ""
-    assert bench.set_parameter("friction_source", "road_friction") == ""
+    assert bench.set_parameter("friction_source", "topic") == ""
     assert bench.set_parameter("friction_timeout_s", 0.5) == ""
     sent = [0]
 

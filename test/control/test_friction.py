@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The friction estimate: on roads whose friction is known, with sensors that are not perfect."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iwm_power_manager.control.friction import estimate
+from iwm_power_manager.control.settings import default_settings
+from iwm_power_manager.control.types import initial_state
+from iwm_power_manager.model.tyre import slip_at_friction
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+from oracles import friction as oracle
+from oracles.physics import slip
+from oracles.step import friction_coefficient
+
+CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+RADIUS, INERTIA, MASS = CAR.front.wheel.radius_m, CAR.front.wheel.inertia_kgm2, CAR.chassis.mass_kg
+SETTINGS = default_settings()
+DT = 0.01
+
+
+class Drive:
+    """Wheels on roads of known friction, as the law remembers and sees them; `error` spoils what is seen."""
+
+    def __init__(self, settings=SETTINGS, speed=15.0):
+        self.settings = settings
+        self.state = initial_state()
+        self.speed = speed
+        self.rows = []
+        self.step((0.9,) * 4, 0.0)
+
+    def load(self, i, accel):
+        c = CAR.chassis
+        arm = c.rear_axle_to_cg_m if i < 2 else c.front_axle_to_cg_m
+        pitch = MASS * accel * c.cg_height_m * (-1.0 if i < 2 else 1.0)
+        return (MASS * 9.81 * arm + pitch) / (2.0 * (c.front_axle_to_cg_m + c.rear_axle_to_cg_m))
+
+    def step(self, friction, used, error=lambda: 0.0, offset=0.0, believed=True):
+        """One step in which each wheel's road force is `used` of its load, or all the road gives."""
+        accel = used * 9.81
+        wheels = []
+        for mu in friction:
+            most = math.copysign(min(abs(used), mu), used)
+            s = slip_at_friction(most, mu, CAR.front.tyre)
+            rim = self.speed * (1.0 + s) if s < 0.0 else self.speed / (1.0 - s)
+            wheels.append(rim / RADIUS * (1.0 + offset) + error())
+        loads = [self.load(i, accel) for i in range(4)]
+        roads = [math.copysign(min(abs(used), mu), used) * n * RADIUS for mu, n in zip(friction, loads, strict=True)]
+        old = self.state.wheels
+        # The torque that, with the spin of the wheel, leaves the road its part.
+        totals = [
+            road + (INERTIA * (w - before.speed_radps) / DT if self.rows else 0.0)
+            for road, w, before in zip(roads, wheels, old, strict=True)
+        ]
+        noisy = error() != 0.0
+        before = tuple(
+            b._replace(total_nm=road if noisy else total, road_nm=road)
+            for b, total, road in zip(old, totals, roads, strict=True)
+        )
+        self.rows.append((self.speed, wheels, [b.total_nm for b in before], roads, DT))
+        grip = estimate(
+            self.state.friction,
+            before,
+            tuple(wheels),
+            self.speed,
+            believed,
+            len(self.rows) == 1,
+            DT,
+            self.settings,
+            CAR,
+        )
+        after = tuple(b._replace(speed_radps=w) for b, w in zip(before, wheels, strict=True))
+        self.state = self.state._replace(wheels=after, friction=grip)
+        return grip
+
+    def gently(self, friction, steps, **errors):
+        """Town: power and brake in turn, no more than a tenth of the weight."""
+        for k in range(steps):
+            self.step((friction,) * 4, 0.08 * math.sin(k / 40.0), **errors)
+        return self.state.friction
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.5, 0.9])
+def test_gentle_driving_with_true_sensors_tells_the_friction_within_seconds(friction):
+    grip = Drive().gently(friction, 600)
+    assert grip.left.friction == pytest.approx(friction, rel=0.06)
+    assert grip.right == grip.left
+    assert grip.left.confidence > 0.9
+    assert grip.assumed == pytest.approx(friction, abs=0.05)
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.5, 0.9])
+@pytest.mark.parametrize("offset", [-0.01, 0.01])
+def test_a_speed_sensor_that_is_wrong_by_a_hundredth_does_not_bias_it(friction, offset):
+    grip = Drive().gently(friction, 1500, offset=offset)
+    assert grip.left.friction == pytest.approx(friction, rel=0.3)
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.5, 0.9])
+def test_noise_of_wheel_speeds_does_not_make_a_road_slippery(friction):
+    rng = np.random.default_rng(3)
+    grip = Drive().gently(friction, 3000, error=lambda: 0.3 * float(rng.standard_normal()))
+    assert grip.assumed == pytest.approx(friction, rel=0.35)
+
+
+def test_a_wheel_that_slips_tells_it_within_a_tenth_of_a_second_on_its_side_only():
+    drive = Drive()
+    drive.gently(0.9, 300)
+    for _ in range(15):
+        grip = drive.step((0.2, 0.9, 0.2, 0.9), -0.5)
+    assert grip.left.friction == pytest.approx(0.2, abs=0.05)
+    assert grip.left.confidence == 1.0
+    assert grip.right.friction > 0.7
+    assert grip.assumed == pytest.approx(grip.left.friction, abs=0.04)
+
+
+def test_it_rises_at_its_rate_and_no_single_point_raises_it_by_more():
+    drive = Drive()
+    for _ in range(50):
+        drive.step((0.2,) * 4, -0.5)
+    before = drive.state.friction.left.friction
+    for k in range(60):
+        now = drive.step((0.9,) * 4, -0.85).left.friction
+        assert now - before <= SETTINGS.friction_rise_per_s * DT + 1e-12
+        before = now
+        if k == 50:
+            assert now > 0.75, "on dry road again within half a second"
+
+
+def test_friction_in_use_is_a_lower_bound():
+    drive = Drive(SETTINGS._replace(friction_prior=0.1))
+    for _ in range(100):
+        grip = drive.step((0.9,) * 4, -0.25)
+    assert grip.left.friction >= 0.24
+
+
+def test_at_rest_it_goes_back_to_the_prior_slowly():
+    drive = Drive()
+    for _ in range(50):
+        drive.step((0.2,) * 4, -0.5)
+    drive.speed = 0.0
+    first = drive.state.friction.left.friction
+    for _ in range(600):
+        grip = drive.step((0.2,) * 4, 0.0)
+    assert first < grip.left.friction < first + 0.2
+    assert grip.left.confidence < 0.95
+    for _ in range(30000):
+        grip = drive.step((0.2,) * 4, 0.0)
+    assert grip.left.friction == pytest.approx(SETTINGS.friction_prior, abs=0.02)
+    assert grip.left.confidence < 0.05
+
+
+def test_nothing_is_learned_while_a_sensor_is_doubted():
+    drive = Drive()
+    before = drive.state.friction.wheels
+    assert drive.gently(0.2, 100, believed=False).wheels == before
+
+
+def test_the_first_step_of_a_run_has_the_prior():
+    grip = Drive(SETTINGS._replace(friction_prior=0.37)).state.friction
+    assert (grip.left.friction, grip.right.confidence, grip.assumed) == (0.37, 0.0, 0.37)
+
+
+@given(
+    st.floats(0.15, 1.0),
+    st.lists(st.floats(-0.08, 0.08), min_size=3, max_size=25),
+    st.floats(4.0, 35.0),
+)
+def test_the_slope_is_that_of_all_points_at_once(friction, used, speed):
+    """Recursion against the definition: means and products over all points, each with the weight it has by now."""
+    drive = Drive(speed=speed)
+    belief = None
+    for part in used:
+        before = drive.state.friction.left
+        grip = drive.step((friction,) * 4, part * friction)
+        left = [oracle.points(drive.rows, i, drive.settings, CAR) for i in (0, 2)]
+        if min(np.ptp([point[0] for point in wheel]) for wheel in left) < 1e-3:
+            continue  # rounding alone tells such points apart
+        told, belief = oracle.slope(left, drive.settings, CAR.front.tyre, DT)
+        prior, rise = drive.settings.friction_prior, drive.settings.friction_rise_per_s * DT
+        change = belief * (told - before.friction) * DT / 1.0
+        change += (1.0 - belief) * (prior - before.friction) * DT / drive.settings.friction_return_s
+        assert grip.left.friction == pytest.approx(before.friction + min(change, rise), rel=1e-6, abs=1e-7)
+        faded = before.confidence * (1.0 - DT / (drive.settings.friction_return_s + DT))
+        assert grip.left.confidence == pytest.approx(max(belief, faded), rel=1e-5, abs=1e-6)
+
+
+def test_the_oracles_slip_is_the_one_the_drive_is_made_of():
+    drive = Drive()
+    drive.step((0.5,) * 4, -0.2)
+    speed, wheels, *_ = drive.rows[-1]
+    assert friction_coefficient(slip(wheels[0], speed, RADIUS, 0.5), 0.5, CAR.front.tyre) == pytest.approx(
+        -0.2, rel=1e-9
+    )
