@@ -237,7 +237,8 @@ def runs_straight(
         and _alike(resisting)
         and _alike(surroundings.friction)
         # At rest, a slope or a motor may start it backwards; what holds it then is Coulomb friction both ways.
-        and (state.speed_mps > 0.0 or (surroundings.grade == 0.0 and min(motors[0], motors[2]) >= 0.0))
+        and (state.speed_mps > 0.0 or surroundings.grade == 0.0)
+        and (state.speed_mps > STANDSTILL_MPS or min(motors[0], motors[2]) >= 0.0)
     )
 
 

@@ -56,6 +56,7 @@ class Evidence(NamedTuple):
     Attributes
     ----------
     verdict, gain : as found; gain is the part of a commanded torque that arrives, 0 for a motor that is switched off
+    stuck_nm : torque that a motor has although it is switched off
     outside_s, inside_s : how long the reports have been outside, or inside while there was a torque to judge
     product, square : sums of commanded times reported and of commanded squared torque while outside, (N m)2
     least_nm, most_nm : of the reports while outside
@@ -64,6 +65,7 @@ class Evidence(NamedTuple):
 
     verdict: MotorVerdict = MotorVerdict.GOOD
     gain: float = 1.0
+    stuck_nm: float = 0.0
     outside_s: float = 0.0
     inside_s: float = 0.0
     product: float = 0.0
@@ -100,6 +102,12 @@ class ActuatorState(NamedTuple):
         """Part of a commanded torque that arrives, motor by motor."""
         a, b, c, d = self.motors
         return (a.gain, b.gain, c.gain, d.gain)
+
+    @property
+    def stuck_nm(self) -> Wheels:
+        """Torque that each motor has whatever it is commanded."""
+        a, b, c, d = self.motors
+        return (a.stuck_nm, b.stuck_nm, c.stuck_nm, d.stuck_nm)
 
 
 #: Ratio of reported to commanded torque below which a motor is dead, and below whose negative it is reversed.
@@ -153,8 +161,11 @@ def _follows(reported_nm: float, least_nm: float, most_nm: float, limits: Actuat
 def _judged(
     motor: Evidence, reported_nm: float, least_nm: float, most_nm: float, dt_s: float, limits: ActuatorLimits
 ) -> Evidence:
-    if math.isnan(reported_nm) or motor.verdict not in (MotorVerdict.GOOD, MotorVerdict.WEAK):
+    if math.isnan(reported_nm):
         return motor
+    if motor.verdict not in (MotorVerdict.GOOD, MotorVerdict.WEAK):
+        off = max(abs(least_nm), abs(most_nm)) <= limits.tolerance_nm
+        return _switched_off(motor, reported_nm, dt_s, limits) if off else motor
     tolerance = _tolerance_nm(least_nm, most_nm, limits)
     if least_nm - tolerance <= reported_nm <= most_nm + tolerance:
         return _inside(motor, max(abs(least_nm), abs(most_nm)) > 2.0 * tolerance, dt_s, limits)
@@ -173,6 +184,16 @@ def _judged(
         return motor
     verdict, gain = _verdict(motor, limits)
     return Evidence(verdict=verdict, gain=gain)
+
+
+def _switched_off(motor: Evidence, reported_nm: float, dt_s: float, limits: ActuatorLimits) -> Evidence:
+    """A motor that is switched off and has a torque all the same is stuck, with that torque."""
+    if abs(reported_nm) <= limits.tolerance_nm:
+        return motor._replace(outside_s=0.0, stuck_nm=0.0)
+    outside_s = motor.outside_s + dt_s
+    if outside_s < limits.confirm_s - 0.5 * dt_s:
+        return motor._replace(outside_s=outside_s)
+    return motor._replace(verdict=MotorVerdict.STUCK, outside_s=outside_s, stuck_nm=reported_nm)
 
 
 def _inside(motor: Evidence, clear: bool, dt_s: float, limits: ActuatorLimits) -> Evidence:

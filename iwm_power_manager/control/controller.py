@@ -187,6 +187,7 @@ class Controller:
             soc=monitor.soc,
             motor_gain=self.actuators.gains,
             direction=monitor.direction,
+            motor_stuck_nm=self.actuators.stuck_nm,
         )
 
     def _settings(self) -> Settings:

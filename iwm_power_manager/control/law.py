@@ -320,13 +320,11 @@ def _friction_nm(given: Given, delivered_nm: float, braking: bool, axle: Axle) -
 
 
 @kernel
-def _after(
-    wheel: Wheel, motor_nm: float, friction_nm: float, before: WheelState, dt_s: float, axle: Axle
-) -> WheelState:
+def _after(wheel: Wheel, motor_nm: float, total_nm: float, before: WheelState, dt_s: float, axle: Axle) -> WheelState:
     """What is remembered of a wheel."""
     return WheelState(
         motor_nm=motor_nm,
-        total_nm=wheel.gain * motor_nm + friction_nm,
+        total_nm=total_nm,
         speed_radps=wheel.speed_radps,
         road_nm=wheel.road_nm,
         slip=wheel.slip,
@@ -542,7 +540,13 @@ def _commanded(
         limits |= LIMIT_BATTERY_CHARGE if power < 0.0 else LIMIT_BATTERY_DISCHARGE
     motor = (scale * wanted[0], scale * wanted[1], scale * wanted[2], scale * wanted[3])
     gain = measurement.motor_gain
-    delivered = (gain[0] * motor[0], gain[1] * motor[1], gain[2] * motor[2], gain[3] * motor[3])
+    stuck = measurement.motor_stuck_nm
+    delivered = (
+        gain[0] * motor[0] + stuck[0],
+        gain[1] * motor[1] + stuck[1],
+        gain[2] * motor[2] + stuck[2],
+        gain[3] * motor[3] + stuck[3],
+    )
     friction = (
         _friction_nm(f.left, delivered[0], braking, vehicle.front),
         _friction_nm(f.right, delivered[1], braking, vehicle.front),
@@ -576,10 +580,10 @@ def _commanded(
         steps=state.steps + 1,
         split=memory,
         wheels=(
-            _after(front.left, motor[0], friction[0], fl0, dt, vehicle.front),
-            _after(front.right, motor[1], friction[1], fr0, dt, vehicle.front),
-            _after(rear.left, motor[2], friction[2], rl0, dt, vehicle.rear),
-            _after(rear.right, motor[3], friction[3], rr0, dt, vehicle.rear),
+            _after(front.left, motor[0], fl_nm, fl0, dt, vehicle.front),
+            _after(front.right, motor[1], fr_nm, fr0, dt, vehicle.front),
+            _after(rear.left, motor[2], rl_nm, rl0, dt, vehicle.rear),
+            _after(rear.right, motor[3], rr_nm, rr0, dt, vehicle.rear),
         ),
         front_unequal_s=_unequal_s(state.front_unequal_s, front.left, front.right, fl_nm != fr_nm, front_short, dt),
         rear_unequal_s=_unequal_s(state.rear_unequal_s, rear.left, rear.right, rl_nm != rr_nm, rear_short, dt),
@@ -682,6 +686,7 @@ def _believed(measurement: Measurement, motion: Motion, travel: float, settings:
         over = (settings.reverse_speed_mps + motion.speed_mps) / REVERSE_FADE_MPS
         demand *= min(max(over, 0.0), 1.0)
     w = motion.wheel_speed_radps
+    stuck = m.motor_stuck_nm
     return Measurement(
         travel * motion.speed_mps,
         (travel * w[0], travel * w[1], travel * w[2], travel * w[3]),
@@ -693,6 +698,7 @@ def _believed(measurement: Measurement, motion: Motion, travel: float, settings:
         m.soc,
         m.motor_gain,
         m.direction,
+        (travel * stuck[0], travel * stuck[1], travel * stuck[2], travel * stuck[3]),
     )
 
 

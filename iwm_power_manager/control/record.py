@@ -38,6 +38,7 @@ _MEASUREMENT = (
     Signal("soc", "state of charge, 0..1"),
     *(Signal(f"{wheel}_motor_gain", "part of a commanded torque the motor delivers, 0..1") for wheel in WHEEL_NAMES),
     Signal("direction", "direction the driver asks for: 1 forwards, -1 reverse"),
+    *(Signal(f"{wheel}_motor_stuck_nm", "torque the motor has whatever it is commanded") for wheel in WHEEL_NAMES),
 )
 _COMMAND = (
     *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in WHEEL_NAMES),
@@ -119,6 +120,7 @@ def to_numbers(
         *measurement[2:8],
         *measurement.motor_gain,
         measurement.direction,
+        *measurement.motor_stuck_nm,
         *decided(command, before, after),
         *supervision[:4],
         watch.wheels_lost,
@@ -132,6 +134,7 @@ def to_numbers(
 YOUNGER_SIGNALS = (
     {"gated_wheels": 0.0, "doubted": 0.0, "hold_nm": 0.0, "direction": 1.0}
     | {f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES}
+    | {f"{wheel}_motor_stuck_nm": 0.0 for wheel in WHEEL_NAMES}
     | {f"{side}_friction": 0.0 for side in ("left", "right")}
     | {f"{side}_friction_confidence": 0.0 for side in ("left", "right")}
 )
@@ -186,6 +189,7 @@ def from_numbers(values: Mapping[str, float]) -> RecordedStep:
         soc=float(known["soc"]),
         motor_gain=wheels("motor_gain"),
         direction=float(known["direction"]),
+        motor_stuck_nm=wheels("motor_stuck_nm"),
     )
     # Integers and flags travel as numbers; the law has to get back the types it was compiled for.
     # A setting that is younger than the record has its default.

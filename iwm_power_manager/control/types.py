@@ -57,6 +57,7 @@ class Measurement(NamedTuple):
     soc : state of charge, 0..1
     motor_gain : part of a commanded torque that each motor delivers, 0..1; 0 switches it off
     direction : the driver asks for, 1 forwards, -1 reverse
+    motor_stuck_nm : torque that a motor has whatever it is commanded; friction makes up for it while braking
     """
 
     speed_mps: float
@@ -69,6 +70,7 @@ class Measurement(NamedTuple):
     soc: float
     motor_gain: Wheels = (1.0, 1.0, 1.0, 1.0)
     direction: float = 1.0
+    motor_stuck_nm: Wheels = (0.0, 0.0, 0.0, 0.0)
 
 
 class Command(NamedTuple):

@@ -179,3 +179,31 @@ def test_what_a_motor_has_lost_comes_from_the_others_and_the_brakes(wheel, gain,
     assert not violated_bound(command, CAR)
     if demand_w < 0.0:
         assert arrived == pytest.approx([demand_w * 0.33 / 40.0] * 4)
+
+
+def test_a_motor_that_pulls_although_it_is_switched_off_is_stuck_with_that_torque_until_it_stops():
+    # It looks reversed at first, since it is braked with and pulls.
+    looks = drive(following(), steady(-60.0, 20), [(60.0,) * 4] * 20)[-1]
+    assert looks.motors[0].verdict is MotorVerdict.REVERSED
+    states = drive(looks, steady(0.0, 30), [(55.0,) * 4] * 30)
+    assert states[2].stuck_nm == (0.0,) * 4, "its last command may still be under way"
+    assert states[-1].motors[0].verdict is MotorVerdict.STUCK
+    assert states[-1].stuck_nm == (55.0,) * 4
+    assert states[-1].gains == (0.0,) * 4
+    unknown = drive(states[-1], steady(0.0, 5), [(math.nan,) * 4] * 5)[-1]
+    assert unknown.stuck_nm == (55.0,) * 4
+    assert drive(unknown, steady(0.0, 5), steady(0.0, 5))[-1].stuck_nm == (0.0,) * 4
+
+
+@pytest.mark.parametrize("wheel", range(4))
+def test_friction_makes_up_for_a_stuck_motor_while_braking(wheel):
+    car = load_vehicle(resolve(Path("config/vehicles/jalalmaab_2015.yaml"))).params
+    stuck = tuple(60.0 if i == wheel else 0.0 for i in range(4))
+    gain = tuple(0.0 if i == wheel else 1.0 for i in range(4))
+    state = initial_state()
+    for _ in range(20):
+        m = Measurement(15.0, (15.0 / 0.33,) * 4, -20e3, DT, 0.9, 1e5, 1e5, 0.5, gain, 1.0, stuck)
+        command, state = law.step(m, state, default_settings("equal"), car, empty_table())
+    totals = [a + b + c for a, b, c in zip(command.motor_torque_nm, command.friction_torque_nm, stuck, strict=True)]
+    assert totals == pytest.approx([-20e3 / 4.0 / 15.0 * 0.33] * 4)
+    assert violated_bound(command, car) == ""

@@ -26,7 +26,9 @@ from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import (
     Command,
     ControllerState,
+    FrictionState,
     Measurement,
+    SideGrip,
     SplitMemory,
     WheelState,
     initial_state,
@@ -222,8 +224,12 @@ FOUR_STATES = st.one_of(
     st.tuples(WHEEL_STATES, WHEEL_STATES).map(lambda axles: (axles[0], axles[0], axles[1], axles[1])),
     st.tuples(WHEEL_STATES, WHEEL_STATES, WHEEL_STATES, WHEEL_STATES),
 )
+SIDES = st.builds(SideGrip, friction=st.floats(0.05, 1.2), confidence=SHARES)
 MEMORIES = st.builds(
     ControllerState,
+    friction=st.builds(
+        FrictionState, left=SIDES, right=SIDES, wheels=st.just(initial_state().friction.wheels), assumed=SHARES
+    ),
     steps=st.integers(0, 2),
     split=st.builds(
         SplitMemory,
