@@ -137,7 +137,7 @@ def _wheel_doubt(
     free = abs(torque_nm) < FREE_PART * load_nm or direction * torque_nm * level < 0.0
     away = abs(level) > STRAY_PART * size + STRAY_MPS
     if free and away and (-change if level > 0.0 else change) < ICE_FRICTION * load_nm / inertia * dt_s:
-        stray_s += dt_s
+        stray_s = min(stray_s + dt_s, 2.0 * RETURN_S)  # no matter for how long it was wrong
     else:
         stray_s = max(stray_s - dt_s, 0.0)
     # A step that jumps away is a fault; one that jumps back is the end of it.

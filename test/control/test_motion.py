@@ -183,3 +183,38 @@ def test_the_estimate_goes_into_the_law():
         command, state = law.step(m, state, s, CAR, empty_table())
     assert command.doubted == DOUBT_SPEED
     assert command.speed_mps == pytest.approx(20.0, abs=0.5)
+
+
+@pytest.mark.parametrize("wheel", range(4))
+def test_a_braked_wheel_that_is_faster_than_the_car_is_not_believed(wheel):
+    car = Car(12.0)
+    for _ in range(20):
+        car.step(0.0)
+    stuck = car.rim[wheel]
+    for _ in range(60):
+        motion = car.step(-400.0, spoil_wheels=lambda w: [stuck if i == wheel else x for i, x in enumerate(w)])
+    assert motion.doubted == 1 << wheel
+
+
+def test_wheels_that_are_all_wrong_by_one_factor_still_tell_the_one_that_locks():
+    car = Car(20.0)
+    for _ in range(30):
+        car.step(-100.0)
+    for _ in range(60):
+        motion = car.step(-100.0, spoil_wheels=lambda w: [0.8 * x for x in w])
+    assert motion.doubted == 15
+    assert motion.wheel_speed_radps == pytest.approx((motion.speed_mps / RADIUS,) * 4)
+    motion = car.step(-100.0, spoil_wheels=lambda w: [0.4 * w[0], *(0.8 * x for x in w[1:])])
+    assert motion.wheel_speed_radps[0] == pytest.approx(0.5 * motion.speed_mps / RADIUS)
+    assert motion.wheel_speed_radps[1:] == pytest.approx((motion.speed_mps / RADIUS,) * 3)
+
+
+@pytest.mark.parametrize("rate", [-5.0, 5.0])
+def test_a_sensor_that_walked_away_leaves_no_wrong_speed_behind(rate):
+    car, k = Car(12.0), 0
+    for k in range(600):
+        motion = car.step(-40.0, lambda v, k=k: v + rate * 0.01 * k)
+        if car.v < 2.0:
+            break
+    assert motion.doubted == DOUBT_SPEED
+    assert motion.speed_mps == pytest.approx(car.v, abs=0.15)
