@@ -295,7 +295,7 @@ def test_friction_may_come_from_its_topic_and_falls_back_when_that_is_stale(benc
 
 def test_what_came_before_activation_is_forgotten(bench) -> None:
     assert bench.set_parameter("friction", 0.9) == ""
-    assert bench.set_parameter("friction_source", "road_friction") == ""
+    assert bench.set_parameter("friction_source", "topic") == ""
     assert bench.change_state("deactivate")
     bench.publish(messages.ROAD_FRICTION, messages.number_message(0.31))
     assert bench.publishers[messages.ROAD_FRICTION].wait_for_all_acked()
