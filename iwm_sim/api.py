@@ -71,7 +71,7 @@ class Drive:
     metrics: Metrics
 
     def saving_percent(self, reference: Drive) -> float | None:
-        """Energy saved against another drive, %; None where the distances differ by more than 0.1 %."""
+        """Energy saved against another drive, %; None if their distances differ by 0.1 %, or one lost the trace."""
         return rows.saving_percent(self.metrics, reference.metrics)
 
     def columns(self) -> Mapping[str, NDArray[np.float64]]:

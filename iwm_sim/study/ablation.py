@@ -67,7 +67,7 @@ PLACES = (("nycc", 0.9), ("udds", 0.9), ("nycc", 0.2), ("udds", 0.2))
 
 @dataclass(frozen=True)
 class Ablated:
-    """A program and what it saves against equal split, %, by place; None where the distances differ."""
+    """A program and what it saves against equal split, %, by place; None as `saving_percent` says."""
 
     program: str
     meaning: str

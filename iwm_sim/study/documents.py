@@ -73,7 +73,7 @@ def savings_table(study: Study) -> str:
         Column("cycle", lambda by: by[labels.ED].place.cycle),
         Column("idle drive", lambda by: by[labels.ED].place.idle_drive),
         Column("ours (`sdp_lookahead`)", saving(labels.OURS), decimals=2),
-        Column("possible at its price of a change", saving(labels.BOUND), decimals=2),
+        Column("possible with its budget of changes", saving(labels.BOUND), decimals=2),
         Column(f"`{RIVAL}`", saving(RIVAL), decimals=2),
         Column("changes a minute: ours / that rival", changes),
         Column("the paper's program here (`paper_sdp`)", saving(labels.PAPER_SDP), decimals=2),

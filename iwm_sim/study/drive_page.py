@@ -44,7 +44,7 @@ class DriveRow:
     ----------
     strategy, made : as in `Driven`
     metrics : what was measured
-    saving_percent : against the reference; None for itself, and where the distances differ
+    saving_percent : against the reference; None for itself, and as `rows.saving_percent` says
     share_changes_per_min : None where the law's decisions are not known
     """
 

@@ -41,7 +41,7 @@ class Row:
     label : what tables call it
     strategy : name in `STRATEGIES`
     metrics : what was measured
-    saving_percent : energy saved against equal split of the same drive; None where the distances differ
+    saving_percent : energy saved against equal split of the same drive; None as `saving_percent` says
     share_of_possible : the saving as a part of the most that `preview` or another strategy saves with no more changes
         than `preview` may make, where that was driven and there is anything to save
     same_distance_as_equal : None without equal split to compare with
@@ -97,8 +97,8 @@ def comparable(one: Metrics, other: Metrics) -> bool:
 
 
 def saving_percent(one: Metrics, reference: Metrics) -> float | None:
-    """Energy saved against a reference, %; None where the distances differ."""
-    if not comparable(one, reference) or reference.energy_wh <= 0.0:
+    """Energy saved against a reference, %; None where the distances differ, or one of the two lost the trace."""
+    if not (one.trace_held and reference.trace_held and comparable(one, reference)) or reference.energy_wh <= 0.0:
         return None
     return 100.0 * (1.0 - one.energy_wh / reference.energy_wh)
 

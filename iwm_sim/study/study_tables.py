@@ -323,10 +323,10 @@ def rivals(study: Study) -> Iterator[TableOf]:
             meaning,
             columns,
             _sorted(by for place, by in by_cell.items() if place.idle_drive == idle_drive),
-            "Saving of battery energy against equal split on the same road; no number where the distances differ by "
-            "more than 0.1 %. instantaneous_slip changes the share only to save the power shown. Preview knows the "
-            "whole cycle; its changes cost what they do in our policy, or nothing. Changes: those by more than 0.25; "
-            "moved is the sum of all, 1 being all the power; blind is instantaneous.",
+            "Saving of battery energy against equal split on the same road; no number where one of them lost the "
+            "trace or the distances differ by more than 0.1 %. instantaneous_slip changes the share only to save the "
+            "power shown. Preview knows the whole cycle; it has our budget of changes, or none. Changes: those by more "
+            "than 0.25; moved is the sum of all, 1 being all the power; blind is instantaneous.",
         )
 
 

@@ -183,7 +183,7 @@ def remarks(rows: Sequence[Row]) -> list[str]:
     """Sentences below the table, about what its marks mean."""
     lines = []
     if not all(row.metrics.trace_held for row in rows):
-        lines.append("lost: the car left the EPA tolerance by the m/s shown; its energy says little")
+        lines.append("lost: the car left the EPA tolerance by the m/s shown; its energy is no saving")
     if any(row.same_distance_as_equal is False for row in rows):
         lines.append("no saving: the distance differs from that of equal split by more than 0.1 %; compare Wh/km")
     with_policy = [row.made_with for row in rows if row.made_with["policy_friction"]]

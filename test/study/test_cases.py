@@ -75,6 +75,35 @@ def test_energies_of_runs_over_different_distances_are_not_compared(equal):
     assert row.saving_percent is None
 
 
+def test_a_run_that_lost_the_trace_saves_nothing_and_against_one_nothing_is_saved(equal):
+    made = cases.result(equal)
+    other = made._replace(case=dataclasses.replace(equal, strategy="sdp"))
+    for runs in ((made, _lost(other)), (_lost(made), other)):
+        assert rows_of(runs)[1].saving_percent is None
+    assert rows_of((made, other))[1].saving_percent == 0.0
+
+
+def _lost(made):
+    return made._replace(metrics=made.metrics._replace(trace_held=False))
+
+
+def test_preview_keeps_a_budget_of_changes_and_the_possible_is_never_below_what_a_strategy_reached(equal):
+    tight = dataclasses.replace(equal, strategy="preview", changes_per_min=4.0)
+    bound = cases.result(tight)
+    assert 0.0 < bound.metrics.share_changes_per_min <= 4.0
+    assert tight.price_text == "at most 4 changes a minute"
+    made = cases.result(equal)
+    better = bound._replace(
+        case=dataclasses.replace(equal, strategy="sdp"),
+        metrics=bound.metrics._replace(energy_wh=0.99 * bound.metrics.energy_wh),
+    )
+    restless = better._replace(metrics=better.metrics._replace(share_changes_per_min=5.0))
+    assert [rows_of((made, bound, run))[1].share_of_possible for run in (better, restless)] == [
+        pytest.approx(rows_of((made, bound))[1].saving_percent / rows_of((made, better))[1].saving_percent),
+        1.0,
+    ]
+
+
 def test_runs_of_different_roads_are_not_compared(equal):
     icy = dataclasses.replace(equal, friction=0.2, strategy="instantaneous")
     assert rows_of([cases.result(equal), cases.result(icy)])[1].saving_percent is None
