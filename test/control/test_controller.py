@@ -302,6 +302,17 @@ class TestBattery:
         assert max(motor(values)) == 0.0
 
 
+class TestMotorReports:
+    def test_a_motor_that_reports_no_torque_is_asked_for_none(self, drive) -> None:
+        drive.run(60, demand=9000.0)
+        for _ in range(60):
+            torques = [0.0 if i == 1 else torque for i, torque in enumerate(motor(drive.steps[-1]))]
+            drive.controller.monitor.take_torques(JointReading(drive.now_ns, NAMES, tuple(torques)))
+            values = drive.run(1, demand=9000.0)
+        assert motor(values)[1] == 0.0
+        assert motor(values)[0] > 1.0
+
+
 class TestRecord:
     def test_signals_have_unique_names_and_meanings(self) -> None:
         assert len(set(SIGNAL_NAMES)) == len(SIGNAL_NAMES)

@@ -423,6 +423,12 @@ for front, rear, share in ((1.05, 1.0, 0.25), (1.0, 1.05, 0.75)):
 """
 
 
+@pytest.mark.parametrize(("name", "code"), [("equal", 99), ("mine", STRATEGIES["sdp"].code)])
+def test_a_name_or_a_code_that_is_taken_is_refused(name, code):
+    with pytest.raises(ValueError, match="has code"):
+        strategies.register(Strategy(name, code, STRATEGIES["equal"].choose))
+
+
 def test_a_strategy_in_a_file_of_its_own_is_registered_and_drives(tmp_path):
     (tmp_path / "toward_grip.py").write_text(_MINE)
     (tmp_path / "drive.py").write_text(_DRIVE)

@@ -29,11 +29,11 @@ def register(strategy: Strategy) -> None:
     ValueError
         Its name or code is taken, or it is too late: the control law has been built from the table.
     """
-    if _sealed:
-        raise ValueError(f"{strategy.name}: the control law is built already; register strategies before importing it")
     for known in STRATEGIES.values():
         if strategy.name == known.name or strategy.code == known.code:
             raise ValueError(f"{strategy.name} ({strategy.code}): {known.name} has code {known.code}")
+    if _sealed:
+        raise ValueError(f"{strategy.name}: the control law is built already; register strategies before importing it")
     STRATEGIES[strategy.name] = strategy
     ordered = sorted(STRATEGIES.values(), key=lambda known: known.code)
     STRATEGIES.clear()
