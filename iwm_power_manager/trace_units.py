@@ -21,6 +21,12 @@ MAX_DECELERATION_MPS2 = 13.0
 MIN_ACCELERATION_MPS2 = 0.02
 _MIN_SAMPLES, _MIN_SPEED_RANGE_MPS = 10, 3.0
 _WINDOW_S, _SHORTEST_S = 1.0, 1e-3
+#: A drive is livelier than driving on roads is where the 95th percentile of speed times acceleration, over the seconds
+#: with more than 0.1 m/s2, exceeds these W/kg by mean speed: Regulation (EU) 2017/1151, annex IIIA, appendix 7a, 4.1.1
+#: (such a drive is no valid test of emissions). Cycles and drives are at 0.3 to 1.0 of it, in km/h at 2.6 and more.
+_LIVELY_MPS2, _LIVELY_FROM_KMH = 0.1, 74.6
+_LIVELY_BELOW, _LIVELY_ABOVE = (14.44, 0.136), (18.966, 0.0742)
+_TOO_LIVELY, _LIVELIEST = 1.7, 1.2
 #: What driving looks like, m/s2: the harder of acceleration and braking is more than this, and neither beyond its own.
 _USUAL_LOW, _USUAL_RISE, _USUAL_FALL = 0.3, 5.0, 9.0
 _MAX_SPEED_MPS = 70.0
@@ -51,6 +57,31 @@ def steepest(time_s: FloatArray, speed_mps: FloatArray) -> Steepest:
     rate = change / window
     up, down = int(np.argmax(rate)), int(np.argmin(rate))
     return Steepest(max(float(rate[up]), 0.0), max(-float(rate[down]), 0.0), up, down)
+
+
+def liveliness(time_s: FloatArray, speed_mps: FloatArray) -> float:
+    """How lively a trace is, by the bound of the regulation on real driving emissions; 0 for one that never gains."""
+    window = max(min(_WINDOW_S, time_s[-1] - time_s[0]), _SHORTEST_S)
+    start = np.arange(time_s[0], time_s[-1] - window, window)
+    before, after = (np.interp(start + shift, time_s, speed_mps) for shift in (0.0, window))
+    rate, speed = (after - before) / window, 0.5 * (before + after)
+    gains = rate > _LIVELY_MPS2
+    if not np.any(gains):
+        return 0.0
+    mean_kmh = 3.6 * float(np.mean(speed[speed > 0.0]))
+    base, slope = _LIVELY_BELOW if mean_kmh <= _LIVELY_FROM_KMH else _LIVELY_ABOVE
+    return float(np.percentile((speed * rate)[gains], 95)) / (base + slope * mean_kmh)
+
+
+def too_lively(time_s: FloatArray, speed_mps: FloatArray) -> str:
+    """A line, where a trace is too lively for a road and would not be in km/h; "" else."""
+    found = liveliness(time_s, speed_mps)
+    if found <= _TOO_LIVELY or liveliness(time_s, speed_mps / 3.6) > _LIVELIEST:
+        return ""
+    return (
+        f"its accelerations at its speeds are {found:.1f} times what driving on roads has (EU 2017/1151, IIIA 7a): "
+        "is it in km/h?"
+    )
 
 
 def likely_units(time: FloatArray, speed: FloatArray) -> tuple[str, str] | None:

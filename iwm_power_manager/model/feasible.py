@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from iwm_power_manager import trace_units
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 
@@ -40,7 +41,7 @@ def _driving_limit_n(axle: Axle, speed_mps: FloatArray) -> FloatArray:
 
 
 def trace_warnings(cycle: Cycle, car: VehicleParams, friction: float) -> list[str]:
-    """What of a trace this car cannot follow on this road, one line for each reason; [] if it can follow all of it.
+    """What of a trace this car cannot follow on this road, one line for each reason, and whether it looks like km/h.
 
     Means over a second against the peak torque and power of the motors, the battery's limit without losses, the grip of
     all four tyres, and the friction brakes. Heat, load transfer and slip come on top: a trace without a warning may be
@@ -67,7 +68,8 @@ def trace_warnings(cycle: Cycle, car: VehicleParams, friction: float) -> list[st
                 f"{cycle.name}: asks {needed[at]:.0f} N at {time[at]:.4g} s ({3.6 * speed[at]:.0f} km/h), and "
                 f"{what} {limit[at]:.0f} N; more than they can for {float(np.sum(span[over])):.3g} s in all"
             )
-    return lines
+    lively = trace_units.too_lively(cycle.time_s, cycle.speed_mps)
+    return [*lines, f"{cycle.name}: {lively}"] if lively else lines
 
 
 def traction_wh_per_km(cycle: Cycle, car: VehicleParams) -> float:

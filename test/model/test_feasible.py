@@ -6,9 +6,12 @@ from __future__ import annotations
 import pytest
 
 from iwm_power_manager.cycle import load_cycle, make_cycle
+from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.feasible import trace_warnings, traction_wh_per_km
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
+from iwm_sim.study.generate import cycle as drawn
+from iwm_sim.study.generate import logged
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
 
@@ -16,6 +19,23 @@ CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
 @pytest.mark.parametrize("name", ["ftp75", "hwfet", "nycc", "udds"])
 def test_the_paper_s_car_can_follow_the_paper_s_cycles_on_a_dry_road(name):
     assert trace_warnings(load_cycle(share_path(f"config/cycles/{name}.csv")), CAR, 0.9) == []
+
+
+def test_a_calm_trace_in_kmh_is_noticed_and_no_cycle_or_drive_gives_a_false_alarm():
+    car = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
+    cycles = [load_cycle(share_path(f"config/cycles/{name}.csv")) for name in ("nycc", "udds", "hwfet", "ftp75")]
+    cycles += [made for seed in range(0, 60, 3) for made in (drawn(seed), logged(drawn(seed), 0.5, seed))]
+    for cycle in cycles:
+        assert not any("km/h?" in line for line in trace_warnings(cycle, car, 0.9))
+    slow = [cycle for cycle in cycles if 3.6 * cycle.speed_mps.max() < 70.0]  # the others are refused
+    assert len(slow) > 5
+    for cycle in slow:
+        try:
+            in_kmh = make_cycle(cycle.name, cycle.time_s, 3.6 * cycle.speed_mps)
+        except ConfigError as error:
+            assert "looks like km/h" in str(error)  # noqa: PT017
+        else:
+            assert trace_warnings(in_kmh, car, 0.9)[-1].endswith("is it in km/h?")
 
 
 def test_nycc_cannot_be_driven_at_friction_0_2():
