@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A car on another DDS: CycloneDDS and nothing of ROS. It publishes what it measures and obeys the torques it is sent.
 
-    pip install -r requirements.txt        # in an environment of its own
-    ./car.py --seconds 20 --demand 4000
+    ./run --seconds 20 --demand 4000        # in an environment of its own, which it makes
 
 The types below are those that ROS 2 messages have on the wire; names of topics begin with `rt`. The plant is a mass on
 four wheels that do not slip: enough to see that commands arrive and mean what they say.
