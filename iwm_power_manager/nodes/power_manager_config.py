@@ -9,8 +9,8 @@ from typing import Any
 
 from iwm_power_manager.control import settings, thresholds
 from iwm_power_manager.control.settings import Change
-from iwm_power_manager.ros import messages
-from iwm_power_manager.ros.parameters import Spec, yaml_text
+from iwm_power_manager.ros.specs import Spec, yaml_text
+from iwm_power_manager.signals import contract
 from iwm_power_manager.signals.mapping import DEFAULT_MAPPING
 
 #: Values of `friction_source` beside "parameter".
@@ -80,7 +80,7 @@ SPECS = (
     Spec("rate_hz", 100.0, "Control rate, Hz.", 10.0, 1000.0),
     Spec(
         "wheel_names",
-        list(messages.WHEEL_NAMES),
+        list(contract.WHEEL_NAMES),
         "Names of the wheels in JointState messages, in the order front left, front right, rear left, rear right.",
         length=4,
     ),

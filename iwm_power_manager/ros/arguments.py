@@ -8,10 +8,8 @@ import itertools
 import sys
 from collections.abc import Iterable, Sequence
 
-from rclpy.utilities import remove_ros_args
-
 from iwm_power_manager.files import read_yaml
-from iwm_power_manager.ros.parameters import ParameterError, Spec
+from iwm_power_manager.ros.specs import ParameterError, Spec
 
 EXIT_CODES = "exit codes: 0 ended as asked, 1 could not start or failed, 2 bad arguments"
 
@@ -59,11 +57,7 @@ def check_arguments(
     ParameterError
         What stands after `--ros-args` is wrong.
     """
-    try:
-        own = remove_ros_args(sys.argv if args is None else list(args))[1:]
-    except RuntimeError as error:
-        # rcl adds where in its sources that was noticed.
-        raise ParameterError(" ".join(str(error).split(", at ")[0].split())) from None
+    given = sys.argv if args is None else list(args)
     parser = argparse.ArgumentParser(
         prog=node,
         usage=f"{node} [-h] [--ros-args --params-file FILE -p PARAMETER:=VALUE -r FROM:=TO ...]",
@@ -71,6 +65,15 @@ def check_arguments(
         epilog=f"{parameters_help(specs)}\n\nexamples:\n{examples}\n{EXIT_CODES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    if "--ros-args" not in given and set(given).intersection(("-h", "--help")):
+        parser.parse_args(given[1:])
+    from rclpy.utilities import remove_ros_args  # which takes its time to be imported
+
+    try:
+        own = remove_ros_args(given)[1:]
+    except RuntimeError as error:
+        # rcl adds where in its sources that was noticed.
+        raise ParameterError(" ".join(str(error).split(", at ")[0].split())) from None
     parser.parse_args(own)
 
 

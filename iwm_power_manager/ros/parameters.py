@@ -9,11 +9,8 @@ also what `docs/interface.md` is tested against.
 from __future__ import annotations
 
 import difflib
-import json
-import math
-import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import (
@@ -25,90 +22,26 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from iwm_power_manager.control.settings import Change as Change  # part of this interface
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.ros.specs import ParameterError as ParameterError
+from iwm_power_manager.ros.specs import Spec as Spec
 
-Value = bool | int | float | str | list[str] | list[float]
-
-
-_WIDTH = 118
 #: Parameters that rclpy declares itself, some of them later.
 _ROS_PREFIXES = ("qos_overrides.", "start_type_description_service", "use_sim_time")
 
 
-class ParameterError(IwmError):
-    """A parameter given at start is wrong."""
-
-
-class Spec(NamedTuple):
-    """One parameter.
-
-    Attributes
-    ----------
-    name : dotted name
-    default : its type is the parameter's type
-    description : one sentence, with the unit where there is one
-    low, high : range of a number; of a list of numbers, of each element
-    choices : allowed texts
-    length : exact length of a list, whose texts have to differ; 0 for any length
-    change : when it may change
-    """
-
-    name: str
-    default: Value
-    description: str
-    low: float = -math.inf
-    high: float = math.inf
-    choices: tuple[str, ...] = ()
-    length: int = 0
-    change: Change = Change.UNCONFIGURED
-
-    @property
-    def holds_texts(self) -> bool:
-        """The parameter is a list of texts."""
-        return isinstance(self.default, list) and isinstance(self.default[0], str)
-
-    def allowed(self) -> str:
-        """What the value may be, for messages and documentation."""
-        if self.choices:
-            return " | ".join(self.choices)
-        if isinstance(self.default, bool):
-            return "true | false"
-        if self.holds_texts:
-            return f"{self.length} different names" if self.length else "a list of texts"
-        if isinstance(self.default, list):
-            return f"{self.length or 'any number of'} numbers from {self.low:g} to {self.high:g}"
-        return "text" if isinstance(self.default, str) else f"{self.low:g} to {self.high:g}"
-
-    def problem(self, value: Any) -> str:
-        """What is wrong with a value of the right type; "" if nothing is."""
-        # Ranges are written so that NaN, which rclpy's own range check lets through, is refused.
-        if self.choices:
-            wrong = value not in self.choices
-        elif isinstance(self.default, bool | str):
-            wrong = False
-        elif not isinstance(self.default, list):
-            wrong = not self.low <= value <= self.high
-        elif self.length and len(value) != self.length:
-            wrong = True
-        elif self.holds_texts:
-            wrong = self.length > 0 and not (all(value) and len(set(value)) == self.length)
-        else:
-            wrong = not all(self.low <= item <= self.high for item in value)
-        return f"{self.name}: {value!r} is not allowed; allowed: {self.allowed()}" if wrong else ""
-
-    def descriptor(self) -> ParameterDescriptor:
-        """What tools like `ros2 param describe` show, and what rclpy enforces."""
-        descriptor = ParameterDescriptor(
-            name=self.name,
-            description=f"{self.description} Changes {self.change.value}.",
-            additional_constraints=self.allowed() if self.choices or self.length else "",
-            read_only=self.change is Change.NEVER,
-        )
-        if isinstance(self.default, float):
-            descriptor.floating_point_range = [FloatingPointRange(from_value=self.low, to_value=self.high)]
-        elif isinstance(self.default, int) and not isinstance(self.default, bool):
-            descriptor.integer_range = [IntegerRange(from_value=int(self.low), to_value=int(self.high))]
-        return descriptor
+def descriptor(spec: Spec) -> ParameterDescriptor:
+    """What tools like `ros2 param describe` show, and what rclpy enforces."""
+    found = ParameterDescriptor(
+        name=spec.name,
+        description=f"{spec.description} Changes {spec.change.value}.",
+        additional_constraints=spec.allowed() if spec.choices or spec.length else "",
+        read_only=spec.change is Change.NEVER,
+    )
+    if isinstance(spec.default, float):
+        found.floating_point_range = [FloatingPointRange(from_value=spec.low, to_value=spec.high)]
+    elif isinstance(spec.default, int) and not isinstance(spec.default, bool):
+        found.integer_range = [IntegerRange(from_value=int(spec.low), to_value=int(spec.high))]
+    return found
 
 
 def declare(node: Node, specs: Sequence[Spec]) -> dict[str, Any]:
@@ -122,7 +55,7 @@ def declare(node: Node, specs: Sequence[Spec]) -> dict[str, Any]:
     values = {}
     for spec in specs:
         try:
-            value = node.declare_parameter(spec.name, spec.default, spec.descriptor()).value
+            value = node.declare_parameter(spec.name, spec.default, descriptor(spec)).value
         except (InvalidParameterTypeException, InvalidParameterValueException, ParameterUninitializedException):
             given = node._parameter_overrides.get(spec.name)  # the exceptions do not all carry the value
             raise ParameterError(
@@ -195,50 +128,6 @@ def check_change(
         new[spec.name] = _plain(parameter.value)
     problem = together(new)
     return SetParametersResult(successful=not problem, reason=problem)
-
-
-def yaml_text(specs: Iterable[Spec], introduction: str) -> str:
-    """A parameter file with every parameter at its default, each below its description.
-
-    Parameters
-    ----------
-    specs : the parameters of a node, whatever its name; those with a dot in their names have to stand together
-    introduction : first lines, without the comment signs
-    """
-    lines = [f"# {line}" for line in textwrap.wrap(introduction, _WIDTH)]
-    lines += ["/**:", "  ros__parameters:"]
-    group = ""
-    for spec in specs:
-        parent, _, name = spec.name.rpartition(".")
-        if parent and parent != group:
-            lines.append(f"    {parent}:")
-        group = parent
-        indent = "      " if parent else "    "
-        lines += [f"{indent}# {line}" for line in textwrap.wrap(spec.description, _WIDTH - len(indent))]
-        lines.append(f"{indent}{name}: {_yaml_value(spec.default)}")
-    return "\n".join(lines) + "\n"
-
-
-def markdown_table(specs: Iterable[Spec]) -> str:
-    """All parameters as a table for the documentation."""
-    lines = ["| parameter | default | allowed | changes | meaning |", "|---|---|---|---|---|"]
-    for spec in specs:
-        allowed = spec.allowed().replace("|", "\\|")
-        default = _yaml_value(spec.default)
-        lines.append(f"| `{spec.name}` | `{default}` | {allowed} | {spec.change.value} | {spec.description} |")
-    return "\n".join(lines) + "\n"
-
-
-def _yaml_value(value: Value) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return f"[{', '.join(_yaml_value(item) for item in value)}]"
-    if isinstance(value, float):
-        # YAML takes 1e6 for a text: a number needs its point.
-        mantissa, _, exponent = repr(value).partition("e")
-        return (mantissa if "." in mantissa else f"{mantissa}.0") + (f"e{exponent}" if exponent else "")
-    return json.dumps(value) if value in ("", "none") else str(value)
 
 
 def _plain(value: Any) -> Any:

@@ -103,7 +103,7 @@ def ros(compiled_law: None) -> Iterator[None]:
 @pytest.fixture
 def node(ros: None) -> Iterator[Any]:
     """A power manager in this process, unconfigured; whoever asks for it serves it."""
-    from iwm_power_manager.nodes.power_manager import PowerManager
+    from iwm_power_manager.nodes.power_manager_node import PowerManager
 
     node = PowerManager()
     yield node

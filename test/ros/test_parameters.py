@@ -13,7 +13,8 @@ from iwm_power_manager.control.thresholds import input_limits
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros.arguments import check_parameter_files
-from iwm_power_manager.ros.parameters import Change, Spec, check_change, markdown_table, yaml_text
+from iwm_power_manager.ros.parameters import Change, Spec, check_change, descriptor
+from iwm_power_manager.ros.specs import markdown_table, yaml_text
 
 SPECS = {
     spec.name: spec
@@ -97,15 +98,15 @@ def test_a_change_is_judged_by_value_by_state_and_together_with_others(name, val
 
 
 def test_descriptors_carry_range_choices_and_when_it_may_change() -> None:
-    gain = SPECS["gain"].descriptor()
+    gain = descriptor(SPECS["gain"])
     assert (gain.floating_point_range[0].from_value, gain.floating_point_range[0].to_value) == (0.0, 1.0)
     assert gain.description == "A gain, 1. Changes at any time."
-    count = SPECS["count"].descriptor()
+    count = descriptor(SPECS["count"])
     assert (count.integer_range[0].from_value, count.integer_range[0].to_value) == (1, 9)
-    assert SPECS["mode"].descriptor().additional_constraints == "a | b"
-    assert SPECS["group.big"].descriptor().read_only
-    assert not SPECS["flag"].descriptor().read_only
-    assert not SPECS["flag"].descriptor().integer_range
+    assert descriptor(SPECS["mode"]).additional_constraints == "a | b"
+    assert descriptor(SPECS["group.big"]).read_only
+    assert not descriptor(SPECS["flag"]).read_only
+    assert not descriptor(SPECS["flag"]).integer_range
 
 
 def test_a_written_parameter_file_reads_back_as_the_defaults() -> None:

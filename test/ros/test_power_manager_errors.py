@@ -34,11 +34,11 @@ def test_an_error_while_configuring_leads_to_unconfigured_and_can_be_overcome(no
     with monkeypatch.context() as patch:
         patch.setattr(preparation, "prepare", broken)
         assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
-        assert node._lifecycle_state() == "unconfigured"
+        assert node.lifecycle_state() == "unconfigured"
         assert faults(node) == ["RuntimeError: out of luck"]
         assert node.count_publishers(messages.WHEEL_TORQUE_COMMAND) == 0
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
-    assert node._lifecycle_state() == "inactive"
+    assert node.lifecycle_state() == "inactive"
     assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
 
 
@@ -59,7 +59,7 @@ def test_a_fault_of_the_law_ends_in_zero_torque_and_inactive(node, executor, mon
         raise ControlFaultError("torque of wheel 0 is not finite")
 
     monkeypatch.setattr(node._controller, "step", broken)
-    until(lambda: node._lifecycle_state() == "inactive", "inactive")
+    until(lambda: node.lifecycle_state() == "inactive", "inactive")
     assert faults(node) == ["torque of wheel 0 is not finite"]
     # What was under way arrives; after that there is nothing more.
     counts = []
@@ -74,7 +74,7 @@ def test_a_fault_of_the_law_ends_in_zero_torque_and_inactive(node, executor, mon
 def test_any_other_error_while_active_ends_there_too(node) -> None:
     assert node.start()
     node.fail("KeyError: 'x'")
-    assert node._lifecycle_state() == "inactive"
+    assert node.lifecycle_state() == "inactive"
     assert faults(node) == ["KeyError: 'x'"]
     assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
     assert faults(node) == []

@@ -51,7 +51,7 @@ def test_a_hostile_policy_or_vehicle_is_refused_with_the_reason_in_the_diagnosti
         for done in node.set_parameters([Parameter(name, value=value) for name, value in wanted.items()])
     )
     assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
-    assert node._lifecycle_state() == "unconfigured"
+    assert node.lifecycle_state() == "unconfigured"
     (reason,) = faults(node)
     assert reason.isprintable()
     assert len(reason) <= 1000

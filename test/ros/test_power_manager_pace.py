@@ -11,7 +11,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
 from iwm_power_manager.control.stepping import RealTime
-from iwm_power_manager.nodes.power_manager import _spin
+from iwm_power_manager.nodes.pace import spin
 from iwm_power_manager.ros.interruption import Interruption
 
 #: Of the node's default rate.
@@ -90,9 +90,9 @@ def test_the_nodes_own_loop_takes_its_steps_like_that_and_serves_the_rest(node, 
         interruption.requested |= len(served) > 400  # nobody asked for a step
 
     node.create_timer(0.5 * PERIOD_S, serve)
-    _spin(node, interruption)
+    spin(node, interruption)
     assert len(waited) >= 20 and served
-    assert node._lifecycle_state() == "inactive"
+    assert node.lifecycle_state() == "inactive"
 
 
 def test_a_clock_set_back_does_not_stop_the_rest(node, monkeypatch) -> None:

@@ -105,13 +105,13 @@ def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, monkeypatch) -> None
 #: A start that fails because a library makes something else of the KeyboardInterrupt, as a ctypes callback does.
 SWALLOWED = """
 import signal, sys
-from iwm_power_manager.nodes import power_manager
+from iwm_power_manager.nodes import power_manager, power_manager_node
 def start(node):
     try:
         signal.raise_signal(signal.SIGINT)
     except KeyboardInterrupt:
         return False
-power_manager.PowerManager.start = start
+power_manager_node.PowerManager.start = start
 sys.exit(power_manager.main())
 """
 

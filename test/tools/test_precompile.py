@@ -26,7 +26,7 @@ solve_policy.main(["--vehicle", "jalalmaab_2015", "--cycle", CYCLE, "--friction"
 """,
     "power_manager": """\
 import rclpy
-from iwm_power_manager.nodes.power_manager import PowerManager
+from iwm_power_manager.nodes.power_manager_node import PowerManager
 rclpy.init()
 node = PowerManager()
 node.trigger_configure()

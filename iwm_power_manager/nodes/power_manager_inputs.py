@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the power manager hears: a subscription to each topic the signals file names, and its messages as readings."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
+from iwm_power_manager.control.monitor import BatteryReading, InputMonitor, JointReading, SpeedReading
+from iwm_power_manager.ros import messages, qos
+from iwm_power_manager.ros.intake import Intake
+from iwm_power_manager.signals.mapping import DEMANDS, PEDALS
+from iwm_power_manager.signals.readings import (
+    DemandReading,
+    DirectionReading,
+    FrictionReading,
+    TopicReader,
+    TorqueReading,
+)
+
+#: The queue of each stamped input of a lock-step set.
+_QUEUES: dict[type, int] = {SpeedReading: SPEED, JointReading: WHEELS, BatteryReading: BATTERY}
+_NS_PER_S = 1_000_000_000
+
+
+class Inputs:
+    """Subscriptions of the power manager.
+
+    Parameters
+    ----------
+    node : whose they are
+    readers : of each topic
+    on_demand : in lock-step, called with each message of the demand, which closes a set; None in real time
+
+    Attributes
+    ----------
+    types : message type of each topic, by full name
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        readers: dict[str, TopicReader],
+        on_demand: Callable[[bytes, dict[str, Any]], None] | None,
+    ) -> None:
+        self._node = node
+        self._readers = readers
+        self._intake = Intake(node)
+        self._demand: tuple[TopicReader, Any] | None = None
+        self.types = {node.resolve_topic_name(topic): reader.read.types.name for topic, reader in readers.items()}
+        for topic, reader in readers.items():
+            kind = messages.message_class(reader.read.types.name)
+            asked = _asked(reader, lockstep=on_demand is not None)
+            if on_demand is not None and set(reader.signals).intersection((*DEMANDS, *PEDALS)):
+                subscription = node.create_subscription(
+                    kind,
+                    topic,
+                    on_demand,
+                    asked,
+                    event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+                    raw=True,
+                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                )
+                self._demand = (reader, subscription)
+            else:
+                self._intake.subscribe(kind, topic, asked, raw=True)
+
+    @property
+    def subscriptions(self) -> list[Any]:
+        """The subscriptions, for whoever wants to know what they are matched with."""
+        return [*self._intake.subscriptions(), *([self._demand[1]] if self._demand else [])]
+
+    def drop_all(self) -> None:
+        """Forget what has arrived."""
+        self._intake.drop_all()
+
+    def take(self, monitor: InputMonitor, now_ns: int) -> None:
+        """Real time: judge what has arrived on every topic."""
+        ahead_ns = now_ns - time.time_ns()  # of DDS, which tells when an unstamped message was sent
+        for topic, reader in self._readers.items():
+            for data, info in self._intake.take(topic):
+                for reading in reader(data, info["source_timestamp"] + ahead_ns):
+                    judge(monitor, reading, now_ns)
+
+    def push_demand(self, queue: LockstepQueue, data: bytes, info: dict[str, Any]) -> None:
+        """Lock-step: a demand into the queue of sets."""
+        assert self._demand is not None
+        sent_ns = info["source_timestamp"]
+        for reading in self._demand[0](data, sent_ns):
+            if isinstance(reading, DemandReading):
+                queue.push_demand(sent_ns, reading.power_w)
+
+    def collect(self, queue: LockstepQueue, monitor: InputMonitor, now_ns: int) -> None:
+        """Lock-step: what belongs to a set into the queue of sets, the rest to the monitor."""
+        for topic, reader in self._readers.items():
+            for data, info in self._intake.take(topic):
+                for reading in reader(data, info["source_timestamp"]):
+                    kind = _QUEUES.get(type(reading))
+                    if kind is not None:
+                        queue.push(kind, reading.stamp_ns, info["source_timestamp"], reading)
+                    else:
+                        judge(monitor, reading, now_ns)
+
+    def close(self) -> None:
+        """Drop the subscriptions."""
+        self._intake.close()
+        if self._demand is not None:
+            self._node.destroy_subscription(self._demand[1])
+            self._demand = None
+
+
+def _asked(reader: TopicReader, *, lockstep: bool) -> QoSProfile:
+    if lockstep:
+        return qos.profile(lockstep=True)
+    reliable = any(source.qos == "reliable" for source in reader.sources)
+    return qos.profile(lockstep=False, depth=qos.INPUT_DEPTH, reliability="reliable" if reliable else "best_effort")
+
+
+def judge(monitor: InputMonitor, reading: Any, now_ns: int) -> None:
+    """Hand a reading to the monitor."""
+    kind = type(reading)
+    if kind is SpeedReading:
+        monitor.take_speed(reading, now_ns)
+    elif kind is JointReading:
+        monitor.take_wheels(reading, now_ns)
+    elif kind is BatteryReading:
+        monitor.take_battery(reading, now_ns)
+    elif kind is DemandReading:
+        monitor.take_demand(reading.power_w, (now_ns - reading.stamp_ns) / _NS_PER_S, now_ns)
+    elif kind is FrictionReading:
+        monitor.take_friction(reading.friction, now_ns)
+    elif kind is TorqueReading:
+        monitor.take_torques(reading)
+    elif kind is DirectionReading:
+        monitor.direction = reading.direction
