@@ -17,6 +17,9 @@ from iwm_power_manager.signals import mapping
 #: What the node waits for is said again after this time.
 REPEAT_S = 5.0
 
+#: What there is to say of an input that is back already.
+_FOR_A_MOMENT = "an input came late; is input_period_s the period your stack has?"
+
 #: Which of the controller's inputs a signal is.
 _INPUTS = (
     {"speed": SPEED, "wheel_speed": WHEELS, "friction": FRICTION}
@@ -110,7 +113,8 @@ class Announcements:
             if waits:
                 self._logger.info(f"waits for {waits}")
         if (mode == MODE_DEGRADED and mode != self._mode) or (stale & ~self._stale and mode == MODE_DEGRADED):
-            self._logger.warning(f"degraded, motor torque fades: {self._missing(controller, topics, trouble, stale)}")
+            missing = self._missing(controller, topics, trouble, stale) or _FOR_A_MOMENT
+            self._logger.warning(f"degraded, motor torque fades: {missing}")
         elif mode == MODE_NORMAL and mode != self._mode:
             self._logger.info(f"{'recovered' if self._was_degraded else 'all inputs are there'}: normal operation")
         self._was_degraded |= mode == MODE_DEGRADED
@@ -129,7 +133,7 @@ class Announcements:
             if not stale & bit or (stale == ~0 and tally.accepted_ns is not None):
                 continue
             found = topics.get(name, ())
-            reason = "; ".join(trouble[topic] for topic in found if topic in trouble)
+            reason = "; ".join(dict.fromkeys(trouble[topic] for topic in found if topic in trouble))
             if not reason and tally.violation is not Violation.NONE:
                 reason = (
                     f"{sum(tally.dropped.values())} messages refused, {tally.violation.name.lower().replace('_', ' ')}"

@@ -120,7 +120,9 @@ def _asked(reader: TopicReader, *, lockstep: bool) -> QoSProfile:
     if lockstep:
         return qos.profile(lockstep=True)
     reliable = any(source.qos == "reliable" for source in reader.sources)
-    return qos.profile(lockstep=False, depth=qos.INPUT_DEPTH, reliability="reliable" if reliable else "best_effort")
+    # Four wheels on four topics are put together: more than the newest of one would come before the first of the next.
+    depth = 1 if any(source.of_one_wheel for source in reader.sources) else qos.INPUT_DEPTH
+    return qos.profile(lockstep=False, depth=depth, reliability="reliable" if reliable else "best_effort")
 
 
 def judge(monitor: InputMonitor, reading: Any, now_ns: int) -> None:

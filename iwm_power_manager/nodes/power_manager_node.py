@@ -99,12 +99,12 @@ class PowerManager(Starting):
         self._fault = ""
         try:
             prepared = self.take_preparation(self._values)
+            self._adopt(prepared)
         except IwmError as error:
             self._fault = str(error)
             self.get_logger().error(self._fault)
             self._release()
             return TransitionCallbackReturn.FAILURE
-        self._adopt(prepared)
         # Publishers and subscriptions of everything the signals file names, and of the state.
         self._outputs = Outputs(self, prepared, None if self._lockstep else self._period_s)
         self._inputs = Inputs(self, prepared.readers, self._on_demand if self._lockstep else None)

@@ -115,6 +115,11 @@ class Source(NamedTuple):
     qos: str = "best_effort"
     stamp: str = "header"
 
+    @property
+    def of_one_wheel(self) -> bool:
+        """One of four sources of a signal of wheels."""
+        return self.key.endswith("]")
+
 
 class SignalMapping(NamedTuple):
     """A checked mapping file.
