@@ -12,12 +12,14 @@ more than sixty budgets and one bucket, whatever is driven, and nothing can hold
 wrong.
 
 The price of a change is the multiplier of the constrained problem. A constant one is optimal: it is the solver's, while
-the bucket is empty. It rises with what is used, and slowly, as an integral controller of the multiplier: in proportion
-to the level in the logarithm, to `DEAREST` times at a full bucket, where hardly any change pays (docs/solver.md derives
-the rate and what it costs).
+the bucket is empty. It rises with what is used, as an integral controller of the multiplier: in proportion to the level
+in the logarithm, to `DEAREST` times at a full bucket, where no change pays (docs/solver.md derives the rate and what it
+costs).
 """
 
 from __future__ import annotations
+
+import math
 
 from iwm_power_manager.jit import kernel
 
@@ -25,7 +27,8 @@ from iwm_power_manager.jit import kernel
 WHOLE_CHANGE = 0.25
 #: Prices of a change at which the solver tabulates the cost-to-go beside its own, as multiples of it.
 DEARER = (3.0, 9.0)
-DEAREST = DEARER[-1]
+#: At a full bucket a change costs this many times the solver's price.
+DEAREST = 20.0
 
 #: The bucket holds this many minutes' budget; at least one change and the way back.
 BUCKET_MIN = 2.0
@@ -68,8 +71,14 @@ def affordable(share: float, previous: float, used: float, changes_per_min: floa
 
 
 @kernel
-def price_level(used: float, changes_per_min: float) -> float:
-    """Where the price stands between the tabulated ones: 0 the solver's, 1 and 2 those of `DEARER`; in proportion."""
+def price_factor(used: float, changes_per_min: float) -> float:
+    """How many times the solver's price a change costs."""
     if changes_per_min <= 0.0:
-        return 0.0
-    return min(used / bucket(changes_per_min), 1.0) * len(DEARER)
+        return 1.0
+    return DEAREST ** min(used / bucket(changes_per_min), 1.0)
+
+
+@kernel
+def price_level(factor: float) -> float:
+    """Where a price stands between the tabulated ones: 0 the solver's, 1 and 2 those of `DEARER`; in the logarithm."""
+    return min(math.log(factor) / math.log(DEARER[-1]), 1.0) * len(DEARER)

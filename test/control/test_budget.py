@@ -49,12 +49,18 @@ def test_no_stretch_of_time_sees_more_than_its_budget_and_one_bucket(wishes, rat
 @given(st.floats(0.0, 200.0), st.floats(0.0, 200.0), RATE)
 def test_the_price_never_falls_with_what_is_used_and_ends_at_the_dearest(one, other, rate):
     low, high = sorted((one, other))
-    assert 0.0 <= budget.price_level(low, rate) <= budget.price_level(high, rate) <= 2.0
-    assert budget.price_level(0.0, rate) == 0.0
-    assert budget.price_level(0.5 * budget.bucket(rate), rate) == pytest.approx(1.0)
-    assert budget.price_level(budget.bucket(rate), rate) == 2.0
+    cheaper, dearer = budget.price_factor(low, rate), budget.price_factor(high, rate)
+    assert 1.0 <= cheaper <= dearer <= budget.DEAREST
+    assert budget.price_factor(0.0, rate) == 1.0
+    assert budget.price_factor(0.5 * budget.bucket(rate), rate) == pytest.approx(budget.DEAREST**0.5)
+
+
+def test_between_the_tabulated_prices_the_logarithm_counts_and_beyond_them_the_last():
+    assert [budget.price_level(factor) for factor in (1.0, 3.0**0.5, 3.0, 9.0, 20.0)] == pytest.approx(
+        [0.0, 0.5, 1.0, 2.0, 2.0]
+    )
 
 
 def test_without_a_budget_nothing_is_counted():
     assert budget.affordable(1.0, 0.0, 1e9, 0.0)
-    assert budget.price_level(1e9, 0.0) == 0.0
+    assert budget.price_factor(1e9, 0.0) == 1.0

@@ -309,7 +309,7 @@ def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_
     prices = np.geomspace(1e-3, 1e4, 200)
     dearest = [max((p for p in prices if moves(p, used)), default=0.0) for used in (0.0, 4.0, 8.0, 14.0, 16.0)]
     assert dearest[0] > dearest[1] > dearest[2] > dearest[3] > dearest[4] == 0.0
-    assert dearest[0] / dearest[3] == pytest.approx(9.0 ** (14.0 / 16.0), rel=0.15)
+    assert dearest[0] / dearest[3] == pytest.approx(20.0 ** (14.0 / 16.0), rel=0.15)
 
 
 def test_a_demand_that_jitters_is_judged_by_the_mean_of_what_it_jitters_between():

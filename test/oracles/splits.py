@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
@@ -98,8 +100,8 @@ def bellman(point, previous, table, outcome, used=0.0, steps=1.0):
     tables, level, factor = [table.expected_cost_j, *table.dearer_cost_j], 0.0, 1.0
     if budget > 0.0:
         full = max(2.0 * budget, 2.0)
-        level = 2.0 * min(used / full, 1.0)
-        factor = 3.0**level
+        factor = 20.0 ** min(used / full, 1.0)
+        level = min(math.log(factor, 3.0), 2.0)
     costs = {}
     for share in (previous, *table.share):
         cost, speed, front, rear = outcome(share)

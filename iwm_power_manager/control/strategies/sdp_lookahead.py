@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from iwm_power_manager.control.budget import DEAREST, affordable, price_level, price_units
+from iwm_power_manager.control.budget import affordable, price_factor, price_level, price_units
 from iwm_power_manager.control.persistence import SAMPLES, held_s
 from iwm_power_manager.control.strategies.instantaneous import LEAST_DIFFERENCE_W
 from iwm_power_manager.control.strategy import Situation, Strategy
@@ -33,8 +33,9 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
     """Share that minimises eq. 31, among those whose change the budget can afford."""
     previous = situation.previous_share
     used = situation.changes_used
-    level = price_level(used, policy.changes_per_min) if policy.dearer_cost_j.shape[0] > 0 else 0.0
-    price = policy.switching_cost_j * (DEAREST ** (level / policy.dearer_cost_j.shape[0]) if level > 0.0 else 1.0)
+    factor = price_factor(used, policy.changes_per_min)
+    level = price_level(factor) if policy.dearer_cost_j.shape[0] > 0 else 0.0
+    price = factor * policy.switching_cost_j
     budgeted = policy.changes_per_min > 0.0
     best = previous
     best_cost = _cost_j(situation, previous, level, vehicle, policy) - LEAST_DIFFERENCE_W * policy.problem.dt_s
