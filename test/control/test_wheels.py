@@ -59,9 +59,9 @@ def measured(demand, wheels=None, speed=SPEED, gain=(1.0,) * 4):
 def remembered(speed=SPEED, **parts) -> ControllerState:
     """The second step of a car that rolls; `parts` : four values of a field of `WheelState`."""
     start = initial_state()
+    parts = {"speed_radps": rolling(speed)} | parts
     wheels = tuple(
-        state._replace(speed_radps=rim, **{name: values[i] for name, values in parts.items()})
-        for i, (state, rim) in enumerate(zip(start.wheels, rolling(speed), strict=True))
+        state._replace(**{name: values[i] for name, values in parts.items()}) for i, state in enumerate(start.wheels)
     )
     motion = start.motion._replace(speed_mps=speed, shown_mps=speed)
     return start._replace(steps=1, wheels=wheels, motion=motion)
@@ -117,8 +117,10 @@ def test_each_motor_s_way_goes_on_from_its_own_torque(wheel):
 
 @WHEELS
 def test_what_the_road_took_is_reckoned_from_the_wheel_s_own_torque_and_change(wheel):
-    before = remembered(total_nm=one(wheel, -120.0, (0.0,) * 4))
-    _, after = step(measured(-3e3), before)
+    # One that turns as its neighbour does shares with it what both seem to take: so it stands apart, then and now.
+    apart = one(wheel, rolling()[wheel] - 2.0, rolling())
+    before = remembered(total_nm=one(wheel, -120.0, (0.0,) * 4), speed_radps=apart)
+    _, after = step(measured(-3e3, apart), before)
     assert [state.road_nm < -1.0 for state in after.wheels] == [i == wheel for i in range(4)]
     gained = one(wheel, rolling()[wheel] + 5.0, rolling())
     _, after = step(measured(-3e3, gained), remembered())
