@@ -99,6 +99,7 @@ def solved(
     say: Callable[[str], None] = lambda _: None,
     because: str = "",
     cycles: Sequence[str] = TRAINING_CYCLES,
+    *,
     budget_per_min: float | None = None,
 ) -> str:
     """A policy for a car (as its file has it) and a road, from the user's cache, or solved now.
