@@ -150,10 +150,6 @@ class McapFile:
         self.writer.flush()
         self.push()
 
-    def duplicate_descriptor(self) -> int:
-        """A descriptor of the open file that stays valid when this one is closed."""
-        return os.dup(self.stream.fileno())
-
     def finish(self, sync: bool = True) -> None:
         """Write the last chunk and the index, with `sync` wait until the disk has them, and close the file."""
         try:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
 
 from iwm_power_manager.bags.limits import MAX_CHANNELS, MAX_CHUNK_MESSAGES, MAX_RECORDS
 from iwm_power_manager.errors import BagError
@@ -156,12 +156,6 @@ def read_record(kind: Any, data: Bytes, record: Record) -> Any:
         found = None
     if found is None or stream.count != record.end - record.body:
         raise BagError(f"holds a damaged {kind.__name__.lower()} record")
-    return found
-
-
-def read_chunk(data: Bytes, record: Record) -> Chunk:
-    """A chunk as the `mcap` package reads it, its content still compressed."""
-    found: Chunk = read_record(Chunk, data, record)
     return found
 
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Header, Metadata, Statistics
+from mcap.records import Chunk, Header, Metadata, Statistics
 
 from iwm_power_manager.bags.limits import MAX_OVERLAP_BYTES, MESSAGE_OVERHEAD_BYTES, decompress, regular_file
 from iwm_power_manager.bags.mcap_records import (
@@ -33,7 +33,6 @@ from iwm_power_manager.bags.mcap_records import (
     ChannelMessage,
     Definitions,
     Record,
-    read_chunk,
     read_record,
     split,
     walk,
@@ -232,7 +231,7 @@ class McapSource:
 
     def raw(self, record: Record) -> bytes:
         """Content of a chunk; `BagError` if it is damaged or too large."""
-        chunk = read_chunk(self.data, record)
+        chunk: Chunk = read_record(Chunk, self.data, record)
         raw = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
         if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:
             raise BagError("is damaged: its checksum is wrong")

@@ -107,11 +107,6 @@ class BagReader:
         """What could not be read so far, a line each; empty for a whole bag."""
         return self._damage + [f"{source.path}: {line}" for source in self.sources for line in source.damage]
 
-    @property
-    def size_bytes(self) -> int:
-        """Size of all files."""
-        return sum(source.path.stat().st_size for source in self.sources)
-
     def messages(self) -> Iterator[Message]:
         """All messages in the order of their log times; equal times keep the order of the recording."""
         sources = sorted(self.sources, key=lambda source: source.start_ns)

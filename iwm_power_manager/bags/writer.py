@@ -213,7 +213,7 @@ class BagWriter:
         with self._failing():
             self._check_disk()
             if not self._disk_work:
-                self._on_disk(partial(_take, self._open.duplicate_descriptor(), then))
+                self._on_disk(partial(_sync_file, self._open.path, then))
 
     def _on_disk(self, work: Callable[[], None]) -> None:
         if self._disk is None:
@@ -295,7 +295,7 @@ class BagWriter:
                     file.abandon()
                 else:
                     finish(file, list(zip(self._topics, self._channels, strict=True)), self.custom_data)
-                    self._on_disk(partial(_take, os.open(file.path, os.O_RDONLY)))
+                    self._on_disk(partial(_sync_file, file.path))
         finally:
             file.abandon()
             self._file = self._file_start_ns = None
@@ -305,12 +305,10 @@ class BagWriter:
             self._closed_bytes += file.size_bytes
 
 
-def _take(descriptor: int, then: Callable[[], object] = lambda: None) -> None:
-    """Wait until the disk has what is in a file, and close the descriptor."""
-    try:
-        os.fdatasync(descriptor)
-    finally:
-        os.close(descriptor)
+def _sync_file(path: Path, then: Callable[[], object] = lambda: None) -> None:
+    """Wait until the disk has what is in a file."""
+    with path.open("rb") as file:
+        os.fdatasync(file.fileno())
     then()
 
 
