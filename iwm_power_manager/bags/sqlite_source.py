@@ -1,23 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of one rosbag2 sqlite3 file, whole or damaged.
+"""Messages of one rosbag2 sqlite3 file: by rosbags where it is whole, row by row where it is damaged.
 
 rosbags refuses a database whose end is missing, asks for as much time as a query wants, and makes an address of the
 file's name (`Sqlite3Reader` in
-https://gitlab.com/ternaris/rosbags/-/blob/master/src/rosbags/rosbag2/storage_sqlite3.py); the two tables need no more
-than the standard library. Nothing that the file defines may run: it is opened read-only and immutable, only tables are
-asked, and a bound on sqlite's own instructions ends a query that does not.
+https://gitlab.com/ternaris/rosbags/-/blob/master/src/rosbags/rosbag2/storage_sqlite3.py). So the file is looked at
+first: read-only and immutable; what it defines may not run, and a bound on sqlite's own instructions ends a query that
+does not.
 """
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import apsw
 from mcap.records import Header
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from iwm_power_manager.bags.limits import (
     MAX_CHUNK_BYTES,
@@ -35,7 +39,8 @@ _TABLES = """
     SELECT name FROM sqlite_master AS found WHERE type = 'table' AND rootpage > 0
     AND NOT EXISTS (SELECT 1 FROM pragma_table_xinfo(found.name) WHERE hidden <> 0)
 """
-_ROWS = "SELECT topic_id, timestamp, data, rowid FROM messages"
+_BY_TIME = "SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, rowid"
+_AS_RECORDED = "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"
 
 
 class SqliteSource:
@@ -67,6 +72,7 @@ class SqliteSource:
         except (sqlite3.Error, ValueError, OverflowError, MemoryError) as error:
             raise BagError(f"{path}: is no readable sqlite3 bag: {_one_line(error)}") from None
         self._count()
+        self._reader = None if self.damage else self._rosbags_reader(stack)
 
     def topics(self) -> dict[int, Topic]:
         """The topic of each id."""
@@ -82,26 +88,41 @@ class SqliteSource:
 
     def messages(self) -> Iterator[ChannelMessage]:
         """All messages in the order of their log times, of a damaged file in the order of recording."""
-        bad = 0
-        last: tuple[Any, Any] = (-1, -1)
-        queries = [f"{_ROWS} ORDER BY timestamp, rowid"] if not self.damage else []
-        queries.append(
-            f"{_ROWS} WHERE (timestamp, rowid) > (?, ?) ORDER BY rowid"
-        )  # without an index, which may be damaged
-        for query in queries:
-            try:
-                for number, log_time, data, row in self._database.execute(query, last if "?" in query else ()):
-                    kinds = type(log_time), type(data)
-                    if number in self._topics and kinds == (int, bytes) and log_time >= 0:
-                        last = (log_time, row)
+        bad = sum(count for number, count in self.counts.items() if number not in self._topics)
+        try:
+            for number, log_time, data in self._rows():
+                if number in self._topics:
+                    if (type(log_time), type(data)) == (int, bytes) and log_time >= 0:
                         yield log_time, number, data, log_time, 0
                     else:
                         bad += 1
-                break
-            except (sqlite3.Error, OverflowError, MemoryError) as error:
-                self.note(f"is not readable to its end: {_one_line(error)}")
+        except (sqlite3.Error, apsw.Error, OverflowError, MemoryError) as error:
+            self.note(f"is not readable to its end: {_one_line(error)}")
         if bad:
             self.note(f"{bad} row(s) hold no message of a known topic")
+
+    def _rows(self) -> Iterator[tuple[Any, Any, Any]]:
+        if self._reader is not None:
+            for connection, log_time, data in self._reader.messages(self._reader.connections):
+                yield connection.id, log_time, data
+        else:
+            yield from self._database.execute(_AS_RECORDED if self.damage else _BY_TIME)
+
+    def _rosbags_reader(self, stack: ExitStack) -> Sqlite3Reader | None:
+        """The reader of rosbags, if it takes this file: its queries end after so many instructions, too."""
+        if re.search(r"[?#%]", str(self.path)):
+            return None
+        reader = Sqlite3Reader(self.path)
+        bound = partial(apsw.Connection.set_progress_handler, callable=self._out_of_steps, nsteps=_STEP)
+        apsw.connection_hooks.append(bound)
+        try:
+            reader.open()
+        except Exception:  # noqa: BLE001 - whatever it makes of other people's tables
+            return None
+        finally:
+            apsw.connection_hooks.remove(bound)
+        stack.callback(reader.close)
+        return reader
 
     def _out_of_steps(self) -> bool:
         self._steps -= 1
@@ -136,7 +157,11 @@ class SqliteSource:
             )
 
     def _count(self) -> None:
+        """Messages by topic, if the file is whole: each page of it is looked at."""
         try:
+            (problem,) = self._database.execute("PRAGMA quick_check(1)").fetchone()
+            if problem != "ok":
+                self.note(f"is damaged: {' '.join(problem.split())}")
             for number, count, start_ns, end_ns in self._database.execute(
                 "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages"
                 " WHERE typeof(timestamp) = 'integer' GROUP BY topic_id"

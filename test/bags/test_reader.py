@@ -138,7 +138,7 @@ def test_a_truncated_sqlite_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> Non
         found = [m.log_time_ns for m in reader.messages()]
         assert found == list(range(1000, 1000 + len(found)))
         assert len(found) > 1000
-        assert "malformed" in reader.damage[0]
+        assert "bag.db3: is damaged: *** in database main" in reader.damage[0]
 
 
 def test_a_sqlite_bag_older_than_type_hashes_and_definitions(tmp_path: Path) -> None:
