@@ -45,7 +45,7 @@ def cheapest_path(cost_j, share, switching_cost_j, switching_fixed_cost_j, path)
     Parameters
     ----------
     cost_j : float64[n, U], cost of each share in each step
-    share : float64[U]
+    share : float64[U], increasing
     switching_cost_j : cost of a change of the share by 1, proportional
     switching_fixed_cost_j : cost of any change
     path : int64[n], output
@@ -55,17 +55,33 @@ def cheapest_path(cost_j, share, switching_cost_j, switching_fixed_cost_j, path)
     total = cost_j[0].copy()
     new = np.empty(n_u)
     for k in range(1, n):
+        # The price grows with the distance, so that the cheapest share to come from is handed on from share to share.
+        from_below = np.inf
+        came = 0
         for u in range(n_u):
-            best = total[u]
-            came = u
-            for s in range(n_u):
-                candidate = total[s] + switching_cost_j * abs(share[u] - share[s]) + switching_fixed_cost_j
-                if s != u and candidate < best:
-                    best = candidate
-                    came = s
-            origin[k, u] = came
-            new[u] = best + cost_j[k, u]
-        total[:] = new
+            new[u] = total[u]
+            origin[k, u] = u
+            if u > 0:
+                move = switching_cost_j * (share[u] - share[u - 1])
+                from_below += move
+                if total[u - 1] + move < from_below:
+                    from_below = total[u - 1] + move
+                    came = u - 1
+                if from_below + switching_fixed_cost_j < new[u]:
+                    new[u] = from_below + switching_fixed_cost_j
+                    origin[k, u] = came
+        from_above = np.inf
+        for u in range(n_u - 2, -1, -1):
+            move = switching_cost_j * (share[u + 1] - share[u])
+            from_above += move
+            if total[u + 1] + move < from_above:
+                from_above = total[u + 1] + move
+                came = u + 1
+            if from_above + switching_fixed_cost_j < new[u]:
+                new[u] = from_above + switching_fixed_cost_j
+                origin[k, u] = came
+        for u in range(n_u):
+            total[u] = new[u] + cost_j[k, u]
     last = np.argmin(total)
     for k in range(n - 1, -1, -1):
         path[k] = last
