@@ -530,13 +530,11 @@ def _moving(
     change = np.zeros(3)
     load = (0.0, 0.0, 0.0, 0.0)
     after_x, after_y, after_rate, coasting, air = v_x, v_y, rate, v_x, 0.0
-    last = math.inf
-    damping = 1.0
+    last, damping = math.inf, 1.0
     for _ in range(_MOST_ITERATIONS):
         load = loads_n((v_x - start_x) / dt_s, (v_y - start_y) / dt_s, v_x + headwind_mps, grade, vehicle)
         matrix[:] = 0.0
-        matrix[0, 0] = mass_rate
-        matrix[1, 1] = mass_rate
+        matrix[0, 0] = matrix[1, 1] = mass_rate
         matrix[2, 2] = yaw_inertia_rate
         total_x, total_y, moment = _tyres(before, v_x, v_y, rate, load, on, dt_s, vehicle, wheels, force, matrix)
         air = math.copysign(aerodynamic_force_n(v_x + headwind_mps, chassis), v_x + headwind_mps)

@@ -49,6 +49,7 @@ from iwm_power_manager.control.types import (
     LIMIT_THERMAL,
     Command,
     ControllerState,
+    FourWheels,
     FrictionState,
     Measurement,
     MotionState,
@@ -498,6 +499,47 @@ def drive(
 
 
 @kernel
+def _delivered_nm(motor_nm: Wheels, gain: Wheels, stuck_nm: Wheels) -> Wheels:
+    """What arrives of the motors' torques."""
+    return (
+        gain[0] * motor_nm[0] + stuck_nm[0],
+        gain[1] * motor_nm[1] + stuck_nm[1],
+        gain[2] * motor_nm[2] + stuck_nm[2],
+        gain[3] * motor_nm[3] + stuck_nm[3],
+    )
+
+
+@kernel
+def _frictions_nm(front: Shared, rear: Shared, delivered_nm: Wheels, braking: bool, vehicle: VehicleParams) -> Wheels:
+    """Friction torque of each wheel."""
+    return (
+        _friction_nm(front.left, delivered_nm[0], braking, vehicle.front),
+        _friction_nm(front.right, delivered_nm[1], braking, vehicle.front),
+        _friction_nm(rear.left, delivered_nm[2], braking, vehicle.rear),
+        _friction_nm(rear.right, delivered_nm[3], braking, vehicle.rear),
+    )
+
+
+@kernel
+def _wheels_after(
+    front: Pair,
+    rear: Pair,
+    motor_nm: Wheels,
+    total_nm: Wheels,
+    before: FourWheels,
+    dt_s: float,
+    vehicle: VehicleParams,
+) -> FourWheels:
+    """What is remembered of the four wheels."""
+    return (
+        _after(front.left, motor_nm[0], total_nm[0], before[0], dt_s, vehicle.front),
+        _after(front.right, motor_nm[1], total_nm[1], before[1], dt_s, vehicle.front),
+        _after(rear.left, motor_nm[2], total_nm[2], before[2], dt_s, vehicle.rear),
+        _after(rear.right, motor_nm[3], total_nm[3], before[3], dt_s, vehicle.rear),
+    )
+
+
+@kernel
 def _commanded(
     measurement: Measurement,
     speed_mps: float,
@@ -539,20 +581,8 @@ def _commanded(
         power = wheels_power_w(wanted, w, 1.0, vehicle)
         limits |= LIMIT_BATTERY_CHARGE if power < 0.0 else LIMIT_BATTERY_DISCHARGE
     motor = (scale * wanted[0], scale * wanted[1], scale * wanted[2], scale * wanted[3])
-    gain = measurement.motor_gain
-    stuck = measurement.motor_stuck_nm
-    delivered = (
-        gain[0] * motor[0] + stuck[0],
-        gain[1] * motor[1] + stuck[1],
-        gain[2] * motor[2] + stuck[2],
-        gain[3] * motor[3] + stuck[3],
-    )
-    friction = (
-        _friction_nm(f.left, delivered[0], braking, vehicle.front),
-        _friction_nm(f.right, delivered[1], braking, vehicle.front),
-        _friction_nm(r.left, delivered[2], braking, vehicle.rear),
-        _friction_nm(r.right, delivered[3], braking, vehicle.rear),
-    )
+    delivered = _delivered_nm(motor, measurement.motor_gain, measurement.motor_stuck_nm)
+    friction = _frictions_nm(f, r, delivered, braking, vehicle)
     fl_nm, fr_nm = delivered[0] + friction[0], delivered[1] + friction[1]
     rl_nm, rr_nm = delivered[2] + friction[2], delivered[3] + friction[3]
     gate = (1 if front_gated else 0) + (2 if rear_gated else 0)
@@ -579,12 +609,7 @@ def _commanded(
     after = ControllerState(
         steps=state.steps + 1,
         split=memory,
-        wheels=(
-            _after(front.left, motor[0], fl_nm, fl0, dt, vehicle.front),
-            _after(front.right, motor[1], fr_nm, fr0, dt, vehicle.front),
-            _after(rear.left, motor[2], rl_nm, rl0, dt, vehicle.rear),
-            _after(rear.right, motor[3], rr_nm, rr0, dt, vehicle.rear),
-        ),
+        wheels=_wheels_after(front, rear, motor, (fl_nm, fr_nm, rl_nm, rr_nm), state.wheels, dt, vehicle),
         front_unequal_s=_unequal_s(state.front_unequal_s, front.left, front.right, fl_nm != fr_nm, front_short, dt),
         rear_unequal_s=_unequal_s(state.rear_unequal_s, rear.left, rear.right, rl_nm != rr_nm, rear_short, dt),
         motion=state.motion,

@@ -137,6 +137,10 @@ class WheelState(NamedTuple):
     heat: float
 
 
+#: The four wheels, in the order of `WHEEL_NAMES`.
+FourWheels = tuple[WheelState, WheelState, WheelState, WheelState]
+
+
 class SplitMemory(NamedTuple):
     """What is remembered of the power split.
 
@@ -246,7 +250,7 @@ class ControllerState(NamedTuple):
 
     steps: int
     split: SplitMemory
-    wheels: tuple[WheelState, WheelState, WheelState, WheelState]
+    wheels: FourWheels
     front_unequal_s: float
     rear_unequal_s: float
     motion: MotionState

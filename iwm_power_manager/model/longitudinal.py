@@ -193,9 +193,7 @@ def step(
     after = max(speed_mps + acceleration_mps2 * dt_s, 0.0)
     # The faster the car is assumed to be, the more the tyres slow it: the root lies between what was too slow and what
     # was too fast. Without the bracket the iteration would swing about a car that locked wheels bring to rest.
-    low = 0.0
-    high = math.inf
-    last_change = math.inf
+    low, high, last_change = 0.0, math.inf, math.inf
     front = rear = ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
     moved = after
     coasting = after

@@ -403,7 +403,7 @@ class PowerManager(Starting):
         self._report_due = False
         now_ns = self._now_ns()
         message = self._report.message(
-            now_ns, self.lifecycle_state(), self._controller, self._values, self._own_statuses()
+            now_ns, self.lifecycle_state(), self._controller, self._values, self.own_statuses()
         )
         self._diagnostics.publish(message)
         if self._demand_log:
@@ -411,7 +411,8 @@ class PowerManager(Starting):
         if self._controller and self._values["gc_off_path"]:
             realtime.collect()
 
-    def _own_statuses(self) -> list[diagnostics.Status]:
+    def own_statuses(self) -> list[diagnostics.Status]:
+        """What the node says of itself beside the controller's report: a fault, its policy, its log of demands."""
         statuses = []
         if self._fault:
             statuses.append(diagnostics.Status("fault", diagnostics.ERROR, self._fault, {}))

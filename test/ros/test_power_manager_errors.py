@@ -10,7 +10,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
-from iwm_power_manager.control.controller import ControlFaultError
+from iwm_power_manager.control.controller import ControlFaultError, Controller
 from iwm_power_manager.nodes import preparation
 from iwm_power_manager.ros import messages, qos
 
@@ -24,7 +24,7 @@ def executor(node):
 
 
 def faults(node) -> list[str]:
-    return [status.message for status in node._own_statuses() if status.name == "fault"]
+    return [status.message for status in node.own_statuses() if status.name == "fault"]
 
 
 def test_an_error_while_configuring_leads_to_unconfigured_and_can_be_overcome(node, monkeypatch) -> None:
@@ -58,7 +58,7 @@ def test_a_fault_of_the_law_ends_in_zero_torque_and_inactive(node, executor, mon
     def broken(*_args) -> None:
         raise ControlFaultError("torque of wheel 0 is not finite")
 
-    monkeypatch.setattr(node._controller, "step", broken)
+    monkeypatch.setattr(Controller, "step", broken)
     until(lambda: node.lifecycle_state() == "inactive", "inactive")
     assert faults(node) == ["torque of wheel 0 is not finite"]
     # What was under way arrives; after that there is nothing more.

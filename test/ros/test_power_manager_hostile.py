@@ -16,7 +16,7 @@ from rclpy.parameter import Parameter
 
 
 def faults(node) -> list[str]:
-    return [status.message for status in node._own_statuses() if status.name == "fault"]
+    return [status.message for status in node.own_statuses() if status.name == "fault"]
 
 
 def garbage(path: Path) -> None:
