@@ -89,6 +89,7 @@ setup(
         "mcap",
         "numba",
         "numpy",
+        "pillow",
         "pyyaml",
         "rosbags",
         "scipy",

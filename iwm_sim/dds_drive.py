@@ -64,6 +64,7 @@ class Plan:
     output : folder for everything that is made
     json : also write the result's rows here
     scenario : file, or name of one of the package's, instead of the cycle; its car and friction are the plan's then
+    animate : draw the drive as a GIF here
     """
 
     cycle: str
@@ -80,6 +81,7 @@ class Plan:
     output: Path
     json: Path | None
     scenario: str = ""
+    animate: Path | None = None
 
 
 class Loaded(NamedTuple):

@@ -3,7 +3,8 @@
 
 `<!-- study: NAME -->` ... `<!-- end -->` is filled from the stored study by the function of that name in `BLOCKS`;
 `<!-- run: COMMAND -->` ... `<!-- end -->` holds what the command printed, below the command. `scripts/docs_numbers`
-fills both.
+fills both. What takes too long, or another machine, stands between `<!-- measured: COMMAND -->` and `<!-- end -->`: by
+hand, and the marker says what prints it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from iwm_sim.study.rows import Place, Row, by_place
 from iwm_sim.study.study_tables import in_order
 from iwm_sim.study.tables import markdown_table
 
-_BLOCK = re.compile(r"<!-- (study|run): (.+?) -->\n(.*?)<!-- end -->", re.DOTALL)
+_BLOCK = re.compile(r"<!-- (study|run|measured): (.+?) -->\n(.*?)<!-- end -->", re.DOTALL)
 
 #: The strongest simple rival, at the price it has by default.
 RIVAL = f"{labels.INSTANTANEOUS_SLIP} {DEFAULTS.switching_power_w:g} W"
@@ -34,6 +35,8 @@ def filled(text: str, study: Study, run: Callable[[str], str] | None = None) -> 
 
     def block(match: re.Match[str]) -> str:
         kind, name, old = match.groups()
+        if kind == "measured":
+            return match.group(0)
         if kind == "study":
             new = BLOCKS[name](study)
         elif run is not None:
@@ -48,6 +51,11 @@ def filled(text: str, study: Study, run: Callable[[str], str] | None = None) -> 
 def commands(text: str) -> list[tuple[str, str]]:
     """Commands of a page's blocks, and what stands there."""
     return [(name, content) for kind, name, content in _BLOCK.findall(text) if kind == "run"]
+
+
+def measurements(text: str) -> list[str]:
+    """Commands that print what a page holds by hand."""
+    return [name for kind, name, _ in _BLOCK.findall(text) if kind == "measured"]
 
 
 def without_blocks(text: str) -> str:

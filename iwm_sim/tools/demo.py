@@ -53,8 +53,10 @@ examples:
     demo --vehicle my_car.yaml --policy my_policies --cycle my_commute.csv --until 30
   A full brake with one side on ice:
     demo --scenario split_stop
+  The drive as a moving picture:
+    demo --output runs/nycc --animate nycc.gif
 
-exit codes: 0 driven, 1 failed, 2 bad arguments or files, 130 interrupted
+exit codes: 0 driven, 1 failed or a file is unusable, 2 bad arguments, 130 interrupted
 """
 
 
@@ -109,7 +111,10 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
         "--output", metavar="DIR", type=Path, help="folder for everything that is made (default: runs/<date and time>)"
     )
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the result's rows here")
+    parser.add_argument("--animate", metavar="GIF", type=Path, help="also draw the drive as a moving picture")
     given = parser.parse_args(arguments)
+    if given.animate and (given.scenario or given.animate.suffix != ".gif"):
+        parser.error(f"--animate {given.animate}: draws a cycle's drive; allowed: a file that ends with .gif")
     return Plan(
         cycle=given.cycle,
         vehicle=given.vehicle,
@@ -125,6 +130,7 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
         output=given.output or Path("runs") / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"),
         json=given.json,
         scenario=given.scenario,
+        animate=given.animate,
     )
 
 
@@ -239,6 +245,11 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
     if plan.record:
         print(f"bag:  {plan.output / 'bag'}")
     print(f"page: {plan.output / 'drive.html'}")
+    if plan.animate:
+        from iwm_sim.study.moving_picture import animate
+
+        animate(run, plan.animate, f"{loaded.cycle.name}, friction {plan.friction:g}, {plan.strategy}")
+        print(f"moving picture: {plan.animate}")
     return 0 if outcome.complete else 1
 
 

@@ -36,6 +36,7 @@ ROSDEP_KEYS = {
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",
     "numba": "python3-numba",
+    "PIL": "python3-pil",
     "numpy": "python3-numpy",
     "rosbags": "python3-rosbags-pip",
     "scipy": "python3-scipy",
@@ -46,7 +47,7 @@ ROSDEP_KEYS = {
 #: Used where they are installed; without them, one line says what to install.
 OPTIONAL = {"dask", "distributed", "pandas", "pyarrow"}
 #: What pip calls a module of another name.
-DISTRIBUTIONS = {"yaml": "pyyaml"}
+DISTRIBUTIONS = {"PIL": "pillow", "yaml": "pyyaml"}
 
 #: Parts that know numbers and files only: usable, and tested, where no ROS is.
 ROS_FREE = [

@@ -70,6 +70,7 @@ def test_a_bad_file_gives_one_line_before_anything_starts(tmp_path, monkeypatch,
         (["--friction", "nan"], "argument --friction: nan is out of range; allowed: 0.05 to 1.5"),
         (["--rate", "5"], "argument --rate: 5 is out of range; allowed: 10 to 1000"),
         (["--strategy", "preview"], "argument --strategy: invalid choice: 'preview'"),
+        (["--animate", "drive.svg"], "--animate drive.svg: draws a cycle's drive; allowed: a file that ends with .gif"),
     ],
 )
 def test_a_bad_argument_is_refused_with_what_is_allowed(capsys, arguments, expected):
