@@ -233,7 +233,7 @@ def to_cycle(log: Log, gaps: str, max_gap_s: float, smooth_s: float, rate_hz: fl
     found = log.gaps(max_gap_s)
     if found and gaps == "refuse":
         start, length = max(found, key=lambda gap: gap[1])
-        problem = f"has {len(found)} gaps, the longest of {length:.4g} s from {start:.6g} s"
+        problem = f"has {len(found)} gap{'s' * (len(found) > 1)}, the longest of {length:.4g} s from {start:.6g} s"
         raise ConfigError(log.name, "", problem, "--gaps bridge, --gaps cut, or a larger --max-gap")
     time: FloatArray = log.time_s
     speed, grade = log.speed_mps, log.grade

@@ -70,7 +70,7 @@ def test_a_gap_is_bridged_or_cut_by_choice_and_never_in_silence(tmp_path, capsys
     output = tmp_path / "trip.csv"
     code, _, err = run(capsys, log, "--output", output)
     assert code == 2
-    assert "has 1 gaps, the longest of 52 s from 199 s; allowed: --gaps bridge, --gaps cut" in err
+    assert "has 1 gap, the longest of 52 s from 199 s; allowed: --gaps bridge, --gaps cut" in err
     assert not output.exists()
     code, out, _ = run(capsys, log, "--output", output, "--gaps", "bridge")
     assert "gap of 52 s from 199 s bridged by a straight line" in out
