@@ -86,6 +86,12 @@ class Announcements:
         inputs = "; ".join(f"{name} from {', '.join(found)}" for name, found in topics.items())
         self._logger.info(f"configured, {rate}: {inputs}; commands to {', '.join(commands)}")
 
+    def held_up(self) -> None:
+        """Tell that the process itself was late."""
+        self._mode = MODE_WAITING
+        if self._due("held up"):
+            self._logger.warning("this process was held up: it starts over, as after activation (own_gap_s)")
+
     def problems(self, found: list[str]) -> None:
         """Tell each endpoint that does not fit, once as long as it is there."""
         for line in found:

@@ -294,6 +294,8 @@ class PowerManager(Starting):
             self.fail(taken.fault)
             return
         if self._stepper.restarts != self._restarts:
+            if isinstance(self._stepper, RealTime):
+                self._says.held_up()
             self._began_anew()
         if taken.step is None:
             if self._answer is not None:

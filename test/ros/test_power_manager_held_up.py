@@ -106,6 +106,7 @@ def run(start_pair, count: int, seed: int) -> list[Hold]:
         check(found[-1], brakes=i % 3 > 0)
         del car.motors[:-1], car.brakes[:-1], pair.bench.states[:-1], pair.bench.torques[:-1]
     assert pair.running.process.poll() is None
+    assert "this process was held up" in pair.running.text()
     return found
 
 
