@@ -21,7 +21,7 @@ test: lint type  ## Linters, types and all tests (20 min)
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 ##@ Results
-.PHONY: policies study unseen docs-numbers roads bench
+.PHONY: policies study unseen docs-numbers roads bench bench-peers
 CYCLES := $(foreach cycle,ftp75 hwfet nycc,--cycle config/cycles/$(cycle).csv)
 policies: setup-run  ## Solve the shipped policies again, the same tables come out (2 min)
 	@for idle in drag none; do $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml --idle-drive $$idle \
@@ -39,13 +39,17 @@ roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside w
 docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (3 min)
 	@$(BIN)/python scripts/docs_numbers $(ARGS)
 
-bench: setup-dev  ## Time control path, bags and closed loop on this machine, each beside a peer
+bench: setup-dev  ## Time control path, bags, solver and closed loop on this machine, each beside a peer
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit $$?; done
 
 ##@ Documentation
 .PHONY: docs
 docs: setup-dev  ## The pages, every --help and the API as a site: build/docs/html/index.html (2 min)
 	@$(BIN)/python scripts/docs_site $(ARGS)
+
+bench-peers: setup-dev  ## FASTSim in an environment of its own, runs/peers: a peer of benchmarks/performance.py
+	@test -x runs/peers/bin/python || $(BIN)/python -m venv runs/peers
+	@runs/peers/bin/python -m pip install --quiet --require-hashes -r benchmarks/requirements.txt
 
 ##@ Safety
 .PHONY: faults soak nightly coverage mutation

@@ -19,6 +19,7 @@ from numba.core.caching import NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.registry import CPUDispatcher
+from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 from numba.core.types import Array
 from numba.core.types.containers import BaseNamedTuple, BaseTuple
@@ -216,7 +217,8 @@ class _Cache(NullCache):
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         """The compiled kernel for a signature, or None."""
         self._started_s[sig] = time.perf_counter()
-        target_context.refresh()
+        # What has been compiled needs numba's run time, not the hundreds of modules that compiling takes.
+        rtsys.initialize(target_context)
         file = self._file(sig, target_context)
         data = STORE.load(file) if file else None
         result = None

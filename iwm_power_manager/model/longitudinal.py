@@ -195,8 +195,7 @@ def step(
     # was too fast. Without the bracket the iteration would swing about a car that locked wheels bring to rest.
     low, high, last_change = 0.0, math.inf, math.inf
     front = rear = ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
-    moved = after
-    coasting = after
+    moved = coasting = after
     for _ in range(60):
         front_n, rear_n = normal_forces_n((after - speed_mps) / dt_s, after, grade, chassis)
         front = axle_step(
