@@ -21,7 +21,7 @@ from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.recorded import RecordedDrive
 from iwm_power_manager.share import share_path
-from iwm_power_manager.tools import solve_policy
+from iwm_power_manager.tools import command, solve_policy
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import closed_loop, learning
 from iwm_sim.learning import CYCLES_ALONE, RECORDING_ALONE, Candidate, Outcome, choose, recorded_cycle, sources_at
@@ -159,7 +159,7 @@ def learned_and_general(bag: Path, folder: Path, friction: float, idle_drive: st
     learned, general = folder / "learned.npz", folder / "general.npz"
     numbers = ["--json", str(folder / "learn.json")]
     trial = ["--bag", str(bag), "--drive", "nycc", *tried, "--jobs", "2", "--output", str(learned)]
-    assert learn.main([*common, *trial, *numbers]) == learn.DONE
+    assert learn.main([*common, *trial, *numbers]) == command.DONE
     cycles = [argument for name in ("ftp75", "hwfet", "nycc") for argument in ("--cycle", name)]
     assert solve_policy.main([*common, *cycles, "--output", str(general)]) == solve_policy.SOLVED
     return [learned, general]
@@ -212,7 +212,7 @@ class TestCommand:
         )
         arguments = ["--vehicle", CAR, "--bag", str(nycc_bag), "--cycle", "udds", "--grid", str(grid)]
         arguments += ["--weights", "0.5", "--jobs", "1", "--friction", "0.9", "0.5", "--output", str(tmp_path / "out")]
-        assert learn.main(arguments) == learn.DONE
+        assert learn.main(arguments) == command.DONE
         text = capsys.readouterr().out
         assert "driven: nycc_drive (597 s)" in text or "driven: nycc_drive (598 s)" in text
         assert text.count("<- chosen") == 2 and text.count("nothing: cycles alone") == 2
@@ -234,7 +234,7 @@ class TestCommand:
         self, nycc_bag: Path, tmp_path: Path, capsys, arguments: list[str], said: str
     ) -> None:
         given = ["--vehicle", CAR, "--bag", str(nycc_bag), "--friction", "0.9", "--output", str(tmp_path / "p.npz")]
-        assert learn.main([*given, *arguments]) == learn.BAD_INPUT
+        assert learn.main([*given, *arguments]) == command.BAD_INPUT
         captured = capsys.readouterr()
         assert captured.out == "" and captured.err.startswith("learn_policy: error: ") and said in captured.err
         assert list(tmp_path.iterdir()) == []
