@@ -9,6 +9,7 @@ process without any of it: the rows are the same, bit for bit. When a worker die
 from __future__ import annotations
 
 import importlib.util
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +29,8 @@ from iwm_sim.fleet.task import Batch, Given, Task, differences, fingerprint, wor
 ANSWER_S, FIRST_WORKER_S = 10, 120
 #: Of work in a batch: beside it, what dask needs for one is nothing (docs/scale.md has the measurement).
 BATCH_S = 2.0
+#: The fewest, for the workers to finish together: a small study has smaller batches.
+BATCHES_PER_WORKER = 20
 
 
 class Summary(NamedTuple):
@@ -137,7 +140,7 @@ class Runner:
         started = time.perf_counter()
         left = self._store.missing(kind, tasks)
         done(len(tasks) - len(left))
-        batches = batched(left, self._batch_s)
+        batches = batched(left, min(self._batch_s, self._even_s(left)))
         cpu_s, workers = 0.0, set()
         for made in self._results(partial(work, given=self._given), batches):
             self._store.add(kind, made)
@@ -146,6 +149,12 @@ class Runner:
             done(len(made.keys))
         wall_s = time.perf_counter() - started
         return Summary(len(tasks), len(tasks) - len(left), len(batches), len(workers), cpu_s, wall_s)
+
+    def _even_s(self, tasks: Sequence[Task]) -> float:
+        """Seconds of work in a batch that let the workers finish together, each with some batches."""
+        if self._client is None:
+            return math.inf
+        return sum(task.seconds for task in tasks) / (BATCHES_PER_WORKER * max(len(self._client.nthreads()), 1))
 
     def _results(self, function: Callable[..., Batch], batches: Sequence[tuple[Task, ...]]) -> Iterator[Batch]:
         if self._client is None:
