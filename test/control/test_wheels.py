@@ -127,6 +127,34 @@ def test_what_the_road_took_is_reckoned_from_the_wheel_s_own_torque_and_change(w
     assert [state.road_nm < -1.0 for state in after.wheels] == [i == wheel for i in range(4)]
 
 
+@WHEELS
+@pytest.mark.parametrize("demand", [-8e3, 8e3])
+def test_what_a_stuck_motor_does_is_done_by_that_wheel(wheel, demand):
+    stuck = one(wheel, 25.0, (0.0,) * 4)
+    command, after = step(measured(demand)._replace(motor_stuck_nm=stuck), remembered(), OFF)
+    commanded = zip(command.motor_torque_nm, command.friction_torque_nm, strict=True)
+    left = [state.total_nm - motor - friction for state, (motor, friction) in zip(after.wheels, commanded, strict=True)]
+    assert left == pytest.approx(stuck)
+
+
+@WHEELS
+def test_the_power_of_an_axle_is_that_of_its_two_wheels(wheel):
+    wheels = one(wheel, 1.03 * rolling()[wheel], rolling())
+    before = remembered(speed_radps=wheels, motor_nm=(60.0,) * 4)
+    command, after = step(measured(12e3, wheels, gain=one(wheel, 0.5, (1.0,) * 4)), before, OFF)
+    power = [state.total_nm * rim for state, rim in zip(after.wheels, wheels, strict=True)]
+    assert power[wheel] != pytest.approx(power[wheel ^ 1], rel=1e-3)
+    assert (command.front_power_w, command.rear_power_w) == pytest.approx((sum(power[:2]), sum(power[2:])))
+
+
+@WHEELS
+def test_each_axle_remembers_how_long_its_own_wheels_were_unequal(wheel):
+    before = remembered()._replace(front_unequal_s=0.5, rear_unequal_s=0.2)
+    _, after = step(measured(12e3, gain=one(wheel, 0.0, (1.0,) * 4)), before)
+    assert after.front_unequal_s == pytest.approx(0.51 if wheel < 2 else 0.49)
+    assert after.rear_unequal_s == pytest.approx(0.21 if wheel >= 2 else 0.19)
+
+
 def test_each_axle_has_its_own_brakes_motors_and_radius():
     command, after = step(measured(-200e3), remembered(), OFF)
     motor, friction = command.motor_torque_nm, command.friction_torque_nm
