@@ -30,7 +30,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 FRICTION = 0.9
-BEGIN, END = "<!-- bench -->", "<!-- end -->"
+BEGIN, END = "<!-- measured: benchmarks/performance.py -->", "<!-- end -->"
 
 #: Row: what it is, its goal, and the peer's row.
 ROWS = {
