@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The study's pages: from the stored numbers alone, and what docs/study.md shows is what they say."""
 
+import html
+import json
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +117,43 @@ def test_page_markdown_and_pictures_are_written(content, material, tmp_path):
     assert page.index(answers.answers(content)[0].question) < page.index("<table")
     assert "http://" not in page.replace("http://www.w3.org", "")
     assert (tmp_path / "study.md").read_text().startswith(f"# {pages.TITLE}")
+
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+@pytest.mark.parametrize("width_px", [1280, 390], ids=["screen", "phone"])
+def test_nothing_of_the_page_is_cut(content, material, tmp_path, width_px):
+    (tmp_path / "figures").mkdir()
+    pages.write(tmp_path, content, drawn(content.frontier, material, vehicle_of("jalalmaab_2015", "none").params))
+    # A frame can be narrower than any window; the text of what stands beyond its edge is said.
+    look = """
+    const frame = document.getElementById("frame");
+    frame.onload = () => {
+      const page = frame.contentDocument, edge = page.documentElement.clientWidth;
+      const cut = [...page.querySelectorAll("h1, h2, p, li, td, th, figure, img, svg")]
+        .filter(part => part.getBoundingClientRect().right > edge + 1 && part.checkVisibility())
+        .map(part => part.tagName + " " + part.textContent.trim().slice(0, 40));
+      document.title = JSON.stringify({wide: page.documentElement.scrollWidth - edge, cut: cut.slice(0, 5)});
+    };
+    frame.srcdoc = PAGE;
+    """
+    source = json.dumps((tmp_path / "study.html").read_text()).replace("</", "<\\/")
+    (tmp_path / "frame.html").write_text(
+        f'<title>-</title><iframe id="frame" style="width:{width_px}px;height:900px;border:0"></iframe>'
+        f"<script>{look.replace('PAGE', source)}</script>"
+    )
+    run = subprocess.run(
+        [
+            CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+            "--window-size=1400,1000", "--virtual-time-budget=5000", "--dump-dom",
+            (tmp_path / "frame.html").as_uri(),
+        ],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    seen = json.loads(html.unescape(run.stdout.split("<title>")[1].split("</title>")[0]))
+    assert seen == {"wide": 0, "cut": []}
 
 
 def test_the_page_needs_nothing_but_the_numbers(content):
