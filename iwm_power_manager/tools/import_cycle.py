@@ -117,7 +117,7 @@ def _import(options: argparse.Namespace) -> None:
 
     vehicle = load_vehicle(resolve(options.vehicle))
     log = read_log(
-        options.log,
+        resolve(options.log),
         time=options.time,
         speed=options.speed,
         grade=options.grade,

@@ -102,9 +102,10 @@ def _import(options: argparse.Namespace) -> None:
 
     from iwm_power_manager.motor_import import map_text, read_points
     from iwm_power_manager.motor_map import fit_loss, map_of, mirrored, missing
+    from iwm_power_manager.share import resolve
 
     points = read_points(
-        options.table,
+        resolve(options.table),
         layout=options.layout,
         down=options.down,
         separator=options.separator,

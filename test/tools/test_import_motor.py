@@ -115,3 +115,10 @@ def test_what_cannot_be_used_is_one_line_and_nothing_is_written(tmp_path, capsys
     assert err.count("\n") == 1
     assert words in err
     assert not (tmp_path / "map.csv").exists()
+
+
+def test_a_file_that_is_not_there_is_answered_with_the_names_near_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "supplier_sheet.csv").write_text("speed,torque,efficiency\n")
+    assert main(["suplier_sheet.csv", "--output", "map.csv"]) == 2
+    assert "did you mean supplier_sheet.csv?" in capsys.readouterr().err
