@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a fleet study costs beside its drives: 1,000 drives with 1, 2 and many workers, near and far.
+
+Each setting drives the same places in a new folder and compares the rows with those of one process. What is measured
+ holds on a busy machine, too: seconds of the processor, and the part of its time that a worker spends in tasks
+(a task that waits for a processor others use is still in it). Far workers reach their scheduler, a process of its own,
+through a relay that holds back every byte for a while, both ways.
+
+`--json docs/scale.json` stores what was measured; `--page docs/scale.md` writes the table into the page, with
+`--json FILE --stored` from the stored numbers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import multiprocessing
+import os
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+#: Workers, one-way latency in ms, and seconds of work in a batch (0: one place each).
+SETTINGS = ((1, 0, 2.0), (2, 0, 2.0), (2, 0, 0.0), (8, 50, 0.0), (8, 50, 2.0))
+FLEET = {
+    "format": 1,
+    "cars": [{"vehicle": "generated:1000..1004"}],
+    "friction": [0.9, 0.5],
+    "strategies": ["instantaneous"],
+    "dt_s": 0.1,
+}
+#: What a batch may cost beside its work.
+ALLOWED = 0.01
+
+
+# --- a network that takes its time ----------------------------------------------------------------------------------
+
+
+async def _pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, delay_s: float) -> None:
+    waiting: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
+
+    async def take() -> None:
+        data = b"start"
+        while data:
+            data = await reader.read(1 << 16)
+            waiting.put_nowait((time.monotonic() + delay_s, data))
+
+    taking = asyncio.create_task(take())
+    while True:
+        due, data = await waiting.get()
+        await asyncio.sleep(max(due - time.monotonic(), 0.0))
+        if not data:
+            break
+        writer.write(data)
+        await writer.drain()
+    await taking
+    writer.close()
+
+
+def relay(port: int, target: tuple[str, int], delay_s: float) -> None:
+    """Listen on a port and pass everything on, both ways, later."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(ConnectionError):
+            there, back = await asyncio.open_connection(*target)
+            await asyncio.gather(_pass_on(reader, back, delay_s), _pass_on(there, writer, delay_s))
+
+    async def main() -> None:
+        async with await asyncio.start_server(serve, "127.0.0.1", port) as server:
+            await server.serve_forever()
+
+    asyncio.run(main())
+
+
+def free_port() -> int:
+    """Port nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def await_port(port: int) -> None:
+    """Wait until somebody listens on a port."""
+    while True:
+        with contextlib.suppress(ConnectionError), socket.create_connection(("127.0.0.1", port)):
+            return
+        time.sleep(0.1)
+
+
+@contextlib.contextmanager
+def far_cluster(workers: int, delay_s: float) -> Iterator[str]:
+    """Address of a scheduler whose workers are far away."""
+    near, far = free_port(), free_port()
+    environment = os.environ | {"NUMBA_NUM_THREADS": "1"}
+    scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", str(near)]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", f"tcp://127.0.0.1:{far}", "--nthreads", "1"]
+    quiet = {"env": environment, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    between = multiprocessing.get_context("spawn").Process(target=relay, args=(far, ("127.0.0.1", near), delay_s))
+    between.start()
+    programs = [subprocess.Popen([*scheduler, "--no-dashboard"], **quiet)]
+    for port in (near, far):
+        await_port(port)
+    programs.append(subprocess.Popen([*worker, "--nworkers", str(workers), "--no-dashboard"], **quiet))
+    try:
+        yield f"tcp://127.0.0.1:{near}"
+    finally:
+        for program in reversed(programs):
+            program.terminate()
+            program.wait()
+        between.terminate()
+        between.join()
+
+
+# --- one setting ----------------------------------------------------------------------------------------------------
+
+
+def processor_s(client) -> dict[str, float]:
+    """Seconds of the processor so far: of this process, the scheduler's (if it is another one), and each worker's."""
+    used = {"here": time.process_time()} | client.run(time.process_time)
+    if client.run_on_scheduler(os.getpid) != os.getpid():
+        used["scheduler"] = client.run_on_scheduler(time.process_time)
+    return used
+
+
+def measure(setting, plan, folder: Path, expected) -> dict[str, float]:
+    """Drive the plan with a setting."""
+    from iwm_sim.fleet.run import Runner, connected
+    from iwm_sim.fleet.store import Store
+    from iwm_sim.fleet.task import Drive, fingerprint
+
+    workers, latency_ms, batch_s = setting
+    far = far_cluster(workers, latency_ms / 1000.0) if latency_ms else contextlib.nullcontext(None)
+    store = Store(folder)
+    with far as address, connected(address, workers) as client:
+        client.wait_for_workers(workers, timeout=300)
+        running = Runner(store, store.begin(fingerprint(), plan.files), client, batch_s)
+        running.check_workers(lambda _: None)
+        rss_mb = max(client.run(lambda: __import__("psutil").Process().memory_info().rss).values()) / 2**20
+        before = processor_s(client)
+        made = running.run(Drive, plan.drives)
+        after = processor_s(client)
+    assert store.table(Drive).equals(expected), "the rows differ from those of one process"
+    used = {name: after[name] - before[name] for name in after}
+    served = used.pop("here") + used.pop("scheduler", 0.0)
+    in_tasks_s = sum(_took(path)["wall_s"] for path in (folder / "rows").iterdir())
+    idle_s = workers * made.wall_s - in_tasks_s
+    return {
+        "workers": workers,
+        "latency_ms": latency_ms,
+        "batch_s": batch_s,
+        "batches": made.batches,
+        "task_cpu_s": made.cpu_s,
+        "wall_s": made.wall_s,
+        "worker_cpu_ms_per_batch": 1000.0 * (sum(used.values()) - made.cpu_s) / made.batches,
+        "scheduler_cpu_s": served,
+        "idle_ms_per_batch": 1000.0 * idle_s / made.batches,
+        "in_tasks_percent": 100.0 * in_tasks_s / (workers * made.wall_s),
+        "worker_mb": rss_mb,
+    }
+
+
+def _took(path: Path) -> dict[str, float]:
+    import pyarrow.parquet as pq
+
+    found = pq.read_schema(path).metadata
+    return {name: float(found[name.encode()]) for name in ("cpu_s", "wall_s")}
+
+
+def run(drives: int) -> dict:
+    """Measure every setting."""
+    from iwm_sim.fleet.plan import plan_of
+    from iwm_sim.fleet.run import runner
+    from iwm_sim.fleet.store import Store
+    from iwm_sim.fleet.task import Drive, fingerprint
+    from iwm_sim.study import cases
+    from iwm_sim.study.cases import Case
+
+    cycles = drives // 20
+    plan = plan_of("benchmark", FLEET | {"cycles": f"generated:1000..{999 + cycles}"})
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store(Path(folder) / "serial")
+        with runner(store, plan.files, None, 1, 2.0) as running:
+            alone = running.run(Drive, plan.drives)
+        rows = []
+        for number, setting in enumerate(SETTINGS):
+            rows.append(measure(setting, plan, Path(folder) / str(number), store.table(Drive)))
+            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+    real = {}
+    for strategy in ("equal", "instantaneous_slip"):
+        case = Case("config/cycles/udds.csv", cases.BASE_CAR, "drag", 0.9, strategy)
+        cases.result(case)
+        started = time.process_time()
+        cases.result(case)
+        real[strategy] = time.process_time() - started
+    return {
+        "drives": 2 * len(plan.drives),
+        "cores": len(os.sched_getaffinity(0)),
+        "processor": fingerprint()["processor"],
+        "load": os.getloadavg()[2],
+        "serial_cpu_s": alone.cpu_s,
+        "udds_cpu_s": real,
+        "settings": rows,
+    }
+
+
+# --- what it means --------------------------------------------------------------------------------------------------
+
+
+def text(found: dict) -> str:
+    """The table and what follows from it, in Markdown."""
+    rows = found["settings"]
+    each_ms = 1000.0 * found["serial_cpu_s"] / found["drives"]
+    lines = [
+        f"{found['drives']} drives (drawn cars and cycles of 300 s, control at 10 Hz, {each_ms:.1f} ms of processor "
+        f"each) on {found['cores']} cores ({found['processor']}), which other work shared (load {found['load']:.0f} "
+        "over 15 minutes); every setting gave the rows of one process, bit for bit. `python benchmarks/fleet.py`:",
+        "",
+        "| workers | network | batch | batches | drives per second of processor | scheduler and client, s of processor "
+        "| worker beside its tasks, ms a batch | worker idle, ms a batch | of its time in tasks |",
+        "|---:|---|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        network = f"{row['latency_ms']} ms each way" if row["latency_ms"] else "this machine"
+        batch = f"{row['batch_s']:g} s at most" if row["batch_s"] else "one place"
+        per_s = found["drives"] / row["task_cpu_s"]
+        lines.append(
+            f"| {row['workers']} | {network} | {batch} | {row['batches']} | {per_s:.0f} "
+            f"| {row['scheduler_cpu_s']:.1f} | {row['worker_cpu_ms_per_batch']:.1f} "
+            f"| {row['idle_ms_per_batch']:.0f} | {row['in_tasks_percent']:.1f} % |"
+        )
+    near, far = (
+        next(row for row in rows if bool(row["latency_ms"]) == away and not row["batch_s"]) for away in (False, True)
+    )
+    hidden_s = [(row["worker_cpu_ms_per_batch"] + row["idle_ms_per_batch"]) / 1000.0 / ALLOWED for row in (near, far)]
+    served_ms = 1000.0 * near["scheduler_cpu_s"] / near["batches"]
+    real_s = sum(found["udds_cpu_s"].values()) / 2.0
+    hours, batches = 1e5 * real_s / 3600.0, 1e5 * real_s / 2.0
+    most = max(row["in_tasks_percent"] for row in rows)
+    lines += [
+        "",
+        f"- **Workers at work**: {most:.1f} % of their time at best, start and end of the study included. Under this "
+        "load client and scheduler wait for a processor like everybody else, and their workers for them.",
+        f"- **What a batch costs beside its work**: {near['worker_cpu_ms_per_batch']:.1f} ms of the worker's processor "
+        f"and {served_ms:.1f} ms of scheduler and client, the Parquet file included. A worker waits "
+        f"{near['idle_ms_per_batch']:.0f} ms for its next batch on this machine, {far['idle_ms_per_batch']:.0f} ms "
+        "over the slow network.",
+        f"- **The batch that hides it** to {100 * ALLOWED:g} %, waiting under this load included: "
+        f"{hidden_s[0]:.1f} s on one machine, {hidden_s[1]:.1f} s far "
+        "away (`--batch`; 2 s is the default).",
+        f"- **One scheduler feeds** about {2000.0 / served_ms:.0f} workers with batches of 2 s; more want larger ones.",
+        f"- **100,000 drives** of UDDS at 100 Hz, half with equal split, half with `instantaneous_slip`, take "
+        f"{hours:.1f} hours of processor ({real_s:.2f} s a drive): {60 * hours / 2:.0f} minutes on 2 cores, "
+        f"{60 * hours / 64:.1f} on 64, in {batches:.0f} batches of 2 s, for which scheduler and client need "
+        f"{batches * served_ms / 60e3:.1f} minutes. A worker takes {max(row['worker_mb'] for row in rows):.0f} MB.",
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure or read, print, store."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--drives", type=int, default=1000)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--stored", action="store_true", help="take the numbers of --json instead of measuring")
+    parser.add_argument("--page", type=Path)
+    options = parser.parse_args()
+    found = json.loads(options.json.read_text()) if options.stored else run(options.drives)
+    if options.json and not options.stored:
+        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    print(text(found))
+    if options.page:
+        old = options.page.read_text()
+        block = f"<!-- measured: benchmarks/fleet.py -->\n{text(found)}\n<!-- end -->"
+        options.page.write_text(
+            re.sub(r"<!-- measured: benchmarks/fleet.py -->.*?<!-- end -->", lambda _: block, old, flags=re.DOTALL)
+        )
+
+
+if __name__ == "__main__":
+    main()
