@@ -46,7 +46,8 @@ STUCK_S, STUCK_MPS = 0.05, 0.3
 #: is this far from them for this long is not believed.
 AGREE_PART, AGREE_MPS = 0.04, 0.3
 ROLLING_FRICTION = 0.08
-NEARLY_FRICTION = 0.15
+#: Below the second torque or this speed, m/s, what they slip makes no wrong speed of them.
+NEARLY_FRICTION, NEARLY_MPS = 0.15, 4.0
 APART_PART, APART_MPS, APART_S = 0.05, 0.5, 0.1
 #: A sensor must have been near the reference for this long before it is believed again.
 DISTRUST_S = 0.5
@@ -54,10 +55,12 @@ DISTRUST_S = 0.5
 JUMP_RADPS = 1.5
 TORQUE_MARGIN = 1.5
 #: A wheel without torque (part of load times radius) and away from the car's speed comes back at least as fast as on
-#: the smoothest ice; one that does not for this long is a bad sensor. It is good again within the second pair.
+#: the smoothest ice; one that does not for this long is a bad sensor. It is good again within the second pair. A gated
+#: wheel is away beyond the third.
 FREE_PART, ICE_FRICTION, RETURN_S = 0.05, 0.03, 0.06
 STRAY_PART, STRAY_MPS = 0.1, 0.5
-GOOD_PART, GOOD_MPS = 0.08, 0.5
+GOOD_PART, GOOD_MPS = 0.06, 0.3
+HELD_PART, HELD_MPS = 0.02, 0.1
 #: A sensor and wheels that differ by no more than this may both be right: tyres, or a wrong radius.
 LEAST_PART = 0.72
 #: Wheels that are all wrong are believed to be so by one factor within this and its inverse.
@@ -115,6 +118,7 @@ def _wheel_doubt(
     dt_s: float,
     stray_s: float,
     doubt_s: float,
+    gated: bool,
     wheel: Wheel,
     load_nm: float,
 ) -> tuple[float, float]:
@@ -135,7 +139,8 @@ def _wheel_doubt(
             jumped = change > TORQUE_MARGIN * max(explained, rolling, 0.0) + JUMP_RADPS
     # Nothing holds a wheel that is free, nor one that is braked and yet faster than the car.
     free = abs(torque_nm) < FREE_PART * load_nm or direction * torque_nm * level < 0.0
-    away = abs(level) > STRAY_PART * size + STRAY_MPS
+    # One that is gated should be back by now: an error that looks like slip would keep it gated for ever.
+    away = abs(level) > (HELD_PART * size + HELD_MPS if gated else STRAY_PART * size + STRAY_MPS)
     if free and away and (-change if level > 0.0 else change) < ICE_FRICTION * load_nm / inertia * dt_s:
         stray_s = min(stray_s + dt_s, 2.0 * RETURN_S)  # no matter for how long it was wrong
     else:
@@ -179,7 +184,8 @@ def _rolling(rims: Wheels, doubt_s: Wheels, turning: _Turning) -> _Rolling:
     used = max(front_used, max(abs(road[2]), abs(road[3])) / turning.rear_nm)
     agree = count >= 3 and high - low <= AGREE_PART * abs(high) + AGREE_MPS
     mean = total / max(count, 1)
-    return _Rolling(count, low, high, mean, agree and used < ROLLING_FRICTION, agree and used < NEARLY_FRICTION)
+    nearly = agree and (used < NEARLY_FRICTION or abs(high) < NEARLY_MPS)
+    return _Rolling(count, low, high, mean, agree and used < ROLLING_FRICTION, nearly)
 
 
 class _Sensor(NamedTuple):
@@ -277,13 +283,14 @@ class _Turning(NamedTuple):
 
     Attributes
     ----------
-    torque_nm, change_radps, road_nm : of each wheel
+    torque_nm, change_radps, road_nm, gated : of each wheel
     front_nm, rear_nm : load times radius, the torque of a road of friction 1
     """
 
     torque_nm: Wheels
     change_radps: Wheels
     road_nm: Wheels
+    gated: tuple[bool, bool, bool, bool]
     front_nm: float
     rear_nm: float
 
@@ -319,7 +326,7 @@ def _turning(
         _road_nm(torque[2], change[2], dt, doubt_s[2] > 0.0, rear.inertia_kgm2, rear_nm),
         _road_nm(torque[3], change[3], dt, doubt_s[3] > 0.0, rear.inertia_kgm2, rear_nm),
     )
-    return _Turning(torque, change, road, front_nm, rear_nm)
+    return _Turning(torque, change, road, (a.gated, b.gated, c.gated, d.gated), front_nm, rear_nm)
 
 
 @kernel
@@ -335,11 +342,19 @@ def _doubts(
 ) -> tuple[Wheels, Wheels]:
     """How long each wheel has stayed away by now, and the time it has yet to be good."""
     front, rear = vehicle.front.wheel, vehicle.rear.wheel
-    torque, change = t.torque_nm, t.change_radps
-    s0, d0 = _wheel_doubt(w[0], change[0], torque[0], predicted, acceleration, dt, stray[0], old[0], front, t.front_nm)
-    s1, d1 = _wheel_doubt(w[1], change[1], torque[1], predicted, acceleration, dt, stray[1], old[1], front, t.front_nm)
-    s2, d2 = _wheel_doubt(w[2], change[2], torque[2], predicted, acceleration, dt, stray[2], old[2], rear, t.rear_nm)
-    s3, d3 = _wheel_doubt(w[3], change[3], torque[3], predicted, acceleration, dt, stray[3], old[3], rear, t.rear_nm)
+    torque, change, g = t.torque_nm, t.change_radps, t.gated
+    s0, d0 = _wheel_doubt(
+        w[0], change[0], torque[0], predicted, acceleration, dt, stray[0], old[0], g[0], front, t.front_nm
+    )
+    s1, d1 = _wheel_doubt(
+        w[1], change[1], torque[1], predicted, acceleration, dt, stray[1], old[1], g[1], front, t.front_nm
+    )
+    s2, d2 = _wheel_doubt(
+        w[2], change[2], torque[2], predicted, acceleration, dt, stray[2], old[2], g[2], rear, t.rear_nm
+    )
+    s3, d3 = _wheel_doubt(
+        w[3], change[3], torque[3], predicted, acceleration, dt, stray[3], old[3], g[3], rear, t.rear_nm
+    )
     return (s0, s1, s2, s3), (d0, d1, d2, d3)
 
 
