@@ -56,11 +56,12 @@ JUMP_RADPS = 1.5
 TORQUE_MARGIN = 1.5
 #: A wheel without torque (part of load times radius) and away from the car's speed comes back at least as fast as on
 #: the smoothest ice; one that does not for this long is a bad sensor. It is good again within the second pair. A gated
-#: wheel is away beyond the third.
+#: wheel is away beyond the third, one that runs against its torque beyond the fourth, which bends stay within.
 FREE_PART, ICE_FRICTION, RETURN_S = 0.05, 0.03, 0.06
 STRAY_PART, STRAY_MPS = 0.1, 0.5
 GOOD_PART, GOOD_MPS = 0.06, 0.3
 HELD_PART, HELD_MPS = 0.02, 0.1
+AGAINST_PART, AGAINST_MPS = 0.05, 0.3
 #: A sensor and wheels that differ by no more than this may both be right: tyres, or a wrong radius.
 LEAST_PART = 0.72
 #: Wheels that are all wrong are believed to be so by one factor within this and its inverse.
@@ -138,10 +139,15 @@ def _wheel_doubt(
         else:
             jumped = change > TORQUE_MARGIN * max(explained, rolling, 0.0) + JUMP_RADPS
     # Nothing holds a wheel that is free, nor one that is braked and yet faster than the car.
-    free = abs(torque_nm) < FREE_PART * load_nm or direction * torque_nm * level < 0.0
+    free = abs(torque_nm) < FREE_PART * load_nm
+    against = direction * torque_nm * level < 0.0 and not free
     # One that is gated should be back by now: an error that looks like slip would keep it gated for ever.
-    away = abs(level) > (HELD_PART * size + HELD_MPS if gated else STRAY_PART * size + STRAY_MPS)
-    if free and away and (-change if level > 0.0 else change) < ICE_FRICTION * load_nm / inertia * dt_s:
+    away = abs(level) > STRAY_PART * size + STRAY_MPS
+    if gated:
+        away = abs(level) > HELD_PART * size + HELD_MPS
+    elif against:
+        away = abs(level) > AGAINST_PART * size + AGAINST_MPS
+    if (free or against) and away and (-change if level > 0.0 else change) < ICE_FRICTION * load_nm / inertia * dt_s:
         stray_s = min(stray_s + dt_s, 2.0 * RETURN_S)  # no matter for how long it was wrong
     else:
         stray_s = max(stray_s - dt_s, 0.0)

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""No single wrong sensor takes the brakes, over whole drives; and wheels that really skid are caught all the same.
+
+Hypothesis draws sensor, error, speed, road and demand; `make nightly` drives many more of them than every run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iwm_sim.faults import WHEELS, Fault
+from iwm_sim.road_run import check_scenario
+from iwm_sim.scenario import Bound, Demand, Friction, Scenario, load_scenario
+
+BASE = load_scenario("speed_high")
+SENSORS = [f"wheel_{name}" for name in WHEELS]
+MOST_S = 5.0
+LEAST_MPS2 = 0.5
+
+
+def wrong(target, kind, value, at_s):
+    return Fault(target, kind, value, at_s, math.inf)
+
+
+SPEEDS = st.one_of(
+    st.tuples(st.just("factor"), st.floats(0.5, 2.0)),
+    st.tuples(st.just("offset"), st.sampled_from((-5.0, 5.0))),
+    st.tuples(st.just("stuck"), st.just(0.0)),
+    st.tuples(st.just("drift_per_s"), st.sampled_from((-5.0, 5.0))),
+)
+#: Anything that a wheel's sensor may show: a part of the truth, beside it, stuck, a number.
+ONE_WHEEL = st.one_of(
+    st.tuples(st.just("factor"), st.floats(-1.0, 2.0)),
+    st.tuples(st.just("offset"), st.floats(-20.0, 20.0)),
+    st.tuples(st.just("stuck"), st.just(0.0)),
+    st.tuples(st.just("value"), st.floats(0.0, 150.0)),
+)
+
+
+@st.composite
+def faults(draw):
+    """A fault of one sensor, from before the braking or in the midst of it."""
+    at_s = draw(st.sampled_from((0.3, 1.5)))
+    if draw(st.booleans()):
+        return (wrong("vehicle_speed", *draw(SPEEDS), at_s),)
+    return (wrong(draw(st.sampled_from(SENSORS)), *draw(ONE_WHEEL), at_s),)
+
+
+def braking(speed_mps: float, power_w: float, friction: float, broken: tuple[Fault, ...]) -> Scenario:
+    return dataclasses.replace(
+        BASE,
+        speed_mps=speed_mps,
+        demand=(Demand(1.0, "power_w", -power_w),),
+        friction=(Friction(0.0, friction, friction),),
+        told_friction=0.9,
+        faults=broken,
+        duration_s=MOST_S,
+    )
+
+
+def it_brakes(speed_mps, power_w, friction, broken):
+    # Of less, the idle drag that ends with it and the wheels' inertia are a sixth with all sensors whole.
+    power_w = max(power_w, LEAST_MPS2 * BASE.truth.chassis.mass_kg * speed_mps)
+    found = check_scenario(braking(speed_mps, power_w, friction, broken)).values
+    assert found["least_braking"] >= 0.85
+    assert found["longest_under_braked_s"] <= 0.3
+
+
+DRAWN = given(st.floats(5.0, 40.0), st.floats(5e3, 60e3), st.sampled_from((0.5, 0.9)), faults())
+
+
+@settings(max_examples=12)
+@DRAWN
+def test_no_single_wrong_sensor_takes_the_brakes(speed_mps, power_w, friction, broken):
+    it_brakes(speed_mps, power_w, friction, broken)
+
+
+@pytest.mark.nightly
+@settings(max_examples=200)
+@DRAWN
+def test_no_single_wrong_sensor_of_many_takes_the_brakes(speed_mps, power_w, friction, broken):
+    it_brakes(speed_mps, power_w, friction, broken)
+
+
+@settings(max_examples=5)
+@given(st.floats(5.0, 40.0), st.floats(20e3, 200e3))
+def test_with_true_sensors_no_wheel_skids_on_a_slippery_road(speed_mps, power_w):
+    scenario = dataclasses.replace(
+        braking(speed_mps, power_w, 0.2, ()),
+        require=(Bound("longest_beyond_critical_s", -math.inf, 0.1, aim=False),),
+        told_friction=0.9,
+    )
+    assert check_scenario(scenario).values["longest_beyond_critical_s"] <= 0.1
