@@ -141,10 +141,23 @@ def test_what_a_stuck_motor_does_is_done_by_that_wheel(wheel, demand):
 def test_the_power_of_an_axle_is_that_of_its_two_wheels(wheel):
     wheels = one(wheel, 1.03 * rolling()[wheel], rolling())
     before = remembered(speed_radps=wheels, motor_nm=(60.0,) * 4)
-    command, after = step(measured(12e3, wheels, gain=one(wheel, 0.5, (1.0,) * 4)), before, OFF)
+    gain = one(wheel, 0.5, (1.0,) * 4)
+    command, after = step(measured(12e3, wheels, gain=gain), before, OFF)
+    arrived = [part * torque for part, torque in zip(gain, command.motor_torque_nm, strict=True)]
+    assert [state.total_nm for state in after.wheels] == pytest.approx(arrived)
     power = [state.total_nm * rim for state, rim in zip(after.wheels, wheels, strict=True)]
     assert power[wheel] != pytest.approx(power[wheel ^ 1], rel=1e-3)
+    assert tuple(state.motor_nm for state in after.wheels) == command.motor_torque_nm
     assert (command.front_power_w, command.rear_power_w) == pytest.approx((sum(power[:2]), sum(power[2:])))
+
+
+@WHEELS
+def test_a_car_that_turns_round_remembers_each_wheel_as_itself(wheel):
+    before = remembered(-2.0, heat=one(wheel, 1.0, (0.0,) * 4))
+    measurement = measured(-500.0, rolling(-2.0), speed=-2.0)._replace(direction=-1.0)
+    _, after = step(measurement, before)
+    assert (before.travel, after.travel) == (1.0, -1.0)
+    assert [state.heat > 0.5 for state in after.wheels] == [i == wheel for i in range(4)]
 
 
 @WHEELS
