@@ -11,6 +11,7 @@ import contextlib
 import difflib
 import os
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 from iwm_power_manager.errors import ConfigError
@@ -73,22 +74,22 @@ def resolve(path: Path | str) -> Path:
             raise ConfigError(given, "", "fits several files of the package", names)
         if matches:
             return matches[0]
-    near = _near_names(given)
+    known = {path.name for root in roots() for path in _files(root)} if len(given.parts) == 1 else set()
+    near = did_you_mean(given, known)
     if near:
-        raise ConfigError(
-            given, "", "cannot be read: No such file or directory; did you mean " + " or ".join(near) + "?"
-        )
+        raise ConfigError(given, "", f"cannot be read: No such file or directory{near}")
     return given
 
 
-def _near_names(given: Path) -> list[str]:
-    """Names of the package's files, and of those beside the one meant, that are spelled much like it."""
-    known = {path.name for root in roots() for path in _files(root)} if len(given.parts) == 1 else set()
+def did_you_mean(given: Path, known: Iterable[str] = ()) -> str:
+    """Question that names up to three of `known`, and of what stands beside `given`, spelled much like it; or ""."""
+    names = set(known)
     with contextlib.suppress(OSError):
-        known |= {path.name for path in given.parent.iterdir()}
-    by_stem = {Path(name).stem: name for name in sorted(known)}
+        names |= {path.name for path in given.parent.iterdir()}
+    by_stem = {Path(name).stem: name for name in sorted(names)}
     near = difflib.get_close_matches(given.stem, by_stem, n=3, cutoff=_NEAR)
-    return [str(given.with_name(by_stem[stem] if given.suffix else stem)) for stem in near]
+    meant = [str(given.with_name(by_stem[stem] if given.suffix else stem)) for stem in near]
+    return f"; did you mean {' or '.join(meant)}?" if meant else ""
 
 
 def _files(root: Path) -> list[Path]:

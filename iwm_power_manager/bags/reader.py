@@ -23,6 +23,7 @@ from iwm_power_manager.bags.mcap_source import McapSource
 from iwm_power_manager.bags.metadata import METADATA_FILE, Topic, information_of, problem_with, text_values
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError
+from iwm_power_manager.share import did_you_mean
 
 Source = McapSource | SqliteSource
 
@@ -73,7 +74,7 @@ class BagReader:
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
         if not os.path.exists(self.path):
-            raise BagError(f"{self.path}: does not exist")
+            raise BagError(f"{self.path}: does not exist{did_you_mean(self.path)}")
         self._stack = ExitStack()
         self._damage: list[str] = []
         self.sources: list[Source] = []

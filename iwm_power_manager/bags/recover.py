@@ -50,6 +50,7 @@ from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.files import sync_folder
+from iwm_power_manager.share import did_you_mean
 
 
 class FileRecovery(NamedTuple):
@@ -172,7 +173,7 @@ def recover(path: Path | str) -> Recovery:
 def _names(path: Path) -> list[Path]:
     """Data files; not those of which an earlier recovery has left its result beside them."""
     if not os.path.exists(path):
-        raise BagError(f"{path}: does not exist")
+        raise BagError(f"{path}: does not exist{did_you_mean(path)}")
     if not path.is_dir():
         if not path.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES):
             raise BagError(f"{path}: is no folder and no .mcap or .db3 file")

@@ -200,6 +200,12 @@ def test_what_is_no_bag_gets_one_clear_line(tmp_path: Path, kind: str, line: str
         BagReader(path)
 
 
+def test_a_bag_that_is_not_there_is_answered_with_the_names_near_it(tmp_path: Path) -> None:
+    (tmp_path / "drive_01").mkdir()
+    with pytest.raises(BagError, match=r"drive_1: does not exist; did you mean \S*drive_01\?"):
+        BagReader(tmp_path / "drive_1")
+
+
 def test_a_compressed_message_that_is_damaged_stays_as_it_is_and_is_reported(tmp_path: Path) -> None:
     torn = b"\x28\xb5\x2f\xfd" + bytes(3)
     with BagWriter(tmp_path / "bag") as bag:
