@@ -120,6 +120,8 @@ class Bench:
             self.publishers[messages.CLOCK] = self.node.create_publisher(
                 messages.TOPIC_TYPES[messages.CLOCK], f"{namespace}/clock", keep_all
             )
+        #: What the motors report where `send` is not told: nothing, so zero.
+        self.reported: Callable[[], tuple[float, ...]] = tuple
         self.torques: list[JointState] = []
         self.frictions: list[JointState] = []
         self.states: list[dict[str, float]] = []
@@ -230,7 +232,9 @@ class Bench:
         wheels = (speed / 0.33,) * 4 if wheels is None else wheels
         set_of_inputs = {
             messages.VEHICLE_SPEED: messages.vehicle_speed_message(stamp, speed),
-            messages.WHEEL_STATES: messages.wheel_states_message(stamp, names, wheels, torques or (0.0,) * len(wheels)),
+            messages.WHEEL_STATES: messages.wheel_states_message(
+                stamp, names, wheels, torques or self.reported() or (0.0,) * len(wheels)
+            ),
             messages.BATTERY_STATE: messages.battery_state_message(
                 stamp, soc=soc, voltage_v=237.0, discharge_current_a=10.0, temperature_c=temperature
             ),

@@ -211,18 +211,16 @@ def test_a_motor_that_reports_no_torque_is_found_and_left_out(start_pair) -> Non
     bench = start_pair().bench
     dead: set[int] = set()
 
-    def follow() -> tuple[float, ...]:
-        """Report the torques that were commanded last, but for dead motors; returns what was commanded."""
-        last = tuple(bench.torques[-1].effort) if bench.torques else (0.0,) * 4
-        bench.send(torques=tuple(0.0 if i in dead else torque for i, torque in enumerate(last)))
-        return last
+    def commanded() -> tuple[float, ...]:
+        return tuple(bench.torques[-1].effort) if bench.torques else (0.0,) * 4
 
+    bench.reported = lambda: tuple(0.0 if i in dead else torque for i, torque in enumerate(commanded()))
     bench.connect()
-    bench.drive(lambda: min(follow()) > 30.0 and bench.mode() == 1, "torque that all motors report")
+    bench.drive(lambda: min(commanded()) > 30.0 and bench.mode() == 1, "torque that all motors report")
     assert bench.status("motors").level == DiagnosticStatus.OK
     dead.add(2)
-    bench.drive(lambda: follow()[2] == 0.0, "the end of the dead motor's command")
-    bench.drive(lambda: follow() and bench.status("motors").level != DiagnosticStatus.OK, "the reason")
+    bench.drive(lambda: commanded()[2] == 0.0, "the end of the dead motor's command")
+    bench.drive(lambda: bench.status("motors").level != DiagnosticStatus.OK, "the reason")
     assert "rear_left" in bench.status("motors").message
 
 
