@@ -5,31 +5,12 @@ from __future__ import annotations
 
 import pytest
 
+from iwm_power_manager.share import resolve
 from iwm_sim.road_report import text
 from iwm_sim.road_run import check_scenario
 from iwm_sim.scenario import load_scenario
 
-HOLDS = (
-    "demand_lost",
-    "hill_hold",
-    "jump_down",
-    "jump_up",
-    "loaded_stop",
-    "motor_dead_drive",
-    "motor_dead_stop",
-    "motor_reversed",
-    "motor_weak",
-    "speed_drift_down",
-    "speed_low",
-    "speed_missing",
-    "split_accelerate",
-    "split_start",
-    "stop_02",
-    "stop_05",
-    "stop_09",
-    "told_too_much",
-    "wheel_high",
-)
+HOLDS = sorted(path.stem for path in resolve("config/scenarios").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("name", HOLDS)
