@@ -27,16 +27,16 @@ policies: setup-run  ## Solve the shipped policies again, the same tables come o
 	@for idle in drag none; do $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml --idle-drive $$idle \
 	  $(CYCLES) --friction 0.9 0.5 0.2 --grid coupled --output policies $(ARGS) || exit $$?; done
 
-study: setup-run  ## All tables and figures of the paper, and what beats them (half an hour)
+study: setup-run  ## All tables and figures of the paper, and what beats them (10 min)
 	@$(BIN)/evaluate --study runs/study $(ARGS)
 
-unseen: setup-run  ## Our strategy on cycles and cars that were not there when it was made (hours; says how long)
+unseen: setup-run  ## Our strategy on cycles and cars that were not there when it was made (says how long)
 	@$(BIN)/evaluate --unseen runs/unseen $(ARGS)
 
-roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required
+roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required (1 min)
 	@$(BIN)/python -m iwm_sim.tools.roads --page docs/roads.md $(ARGS)
 
-docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (3 min)
+docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (2 min)
 	@$(BIN)/python scripts/docs_numbers $(ARGS)
 
 bench: setup-dev  ## Time control path, bags, solver and closed loop on this machine, each beside a peer
