@@ -13,7 +13,8 @@ from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
 REAL_TIME_DEPTH = 1
-LOCKSTEP_DEPTH = 100
+#: Three seconds of 600 steps: a recorder on a busy machine may be that far behind the loop it records.
+LOCKSTEP_DEPTH = 2000
 #: Of an input: a second publisher as fast as the car's must not push the car's own messages out.
 INPUT_DEPTH = 4
 
