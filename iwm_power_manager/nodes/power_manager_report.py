@@ -25,10 +25,14 @@ class PowerManagerReport:
         self._loop = diagnostics.LoopStatistics()
         self._inputs = diagnostics.InputReport()
         self._activity: Counter[str] = Counter()
+        self._steps = 0
+        self._doubted: Counter[int] = Counter()
 
     def note_step(self, command: Command, period_s: float | None, execution_s: float) -> None:
         """Count one step of the active node."""
         self._loop.add(period_s, execution_s)
+        self._steps += 1
+        self._doubted.update(number for number in range(5) if command.doubted & 1 << number)
         if command.gate != GATE_NONE:
             self._activity["gate"] += 1
         if command.limits:
@@ -74,9 +78,12 @@ class PowerManagerReport:
                     self._wheel_names,
                 )
             )
+            statuses.append(diagnostics.sensors_status(self._doubted, self._steps, self._wheel_names))
             statuses.append(diagnostics.motors_status(controller.actuators, self._wheel_names))
             statuses.append(self._loop.report(self._rate_hz, values))
         self._activity.clear()
+        self._doubted.clear()
+        self._steps = 0
         return diagnostics.to_message(now_ns, self._node_name, [*statuses, *extra])
 
 

@@ -220,5 +220,24 @@ def motors_status(actuators: ActuatorState, wheel_names: Sequence[str]) -> Statu
     return Status("motors", level, message, values)
 
 
+def sensors_status(doubted_steps: Mapping[int, int], steps: int, wheel_names: Sequence[str]) -> Status:
+    """Which speed sensors the law did not believe in most of its steps, because they contradict the others.
+
+    Parameters
+    ----------
+    doubted_steps : steps in which it was not believed, by number of the wheel; 4 is `vehicle_speed`
+    steps : steps since the last report
+    wheel_names : the wheels in their order
+    """
+    names = [*(f"wheel {name}" for name in wheel_names), "vehicle_speed"]
+    values = {
+        f"{name}: not believed (% of the steps)": f"{100.0 * doubted_steps.get(number, 0) / max(steps, 1):.0f}"
+        for number, name in enumerate(names)
+    }
+    contradicted = [name for number, name in enumerate(names) if 2 * doubted_steps.get(number, 0) > steps]
+    problem = f"{', '.join(contradicted)} not believed: contradicts the others; right unit and scale?"
+    return Status("sensors", *_worst([(WARN, problem)] if contradicted else []), values)
+
+
 def _words(code: Violation | WheelVerdict | MotorVerdict) -> str:
     return code.name.lower().replace("_", " ")

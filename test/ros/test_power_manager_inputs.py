@@ -157,7 +157,7 @@ class TestDiagnostics:
         full_name = f"{bench.node.get_namespace()}/power_manager"
         assert {status.name for status in bench.diagnostics[-1].status} == {
             f"{full_name}: {name}"
-            for name in ("control", "inputs", "motors", "control loop", "policy", "command topics")
+            for name in ("control", "inputs", "sensors", "motors", "control loop", "policy", "command topics")
         }
         assert {status.hardware_id for status in bench.diagnostics[-1].status} == {full_name}
         for name in ("control", "inputs", "policy", "command topics"):
@@ -222,6 +222,15 @@ def test_a_motor_that_reports_no_torque_is_found_and_left_out(start_pair) -> Non
     bench.drive(lambda: commanded()[2] == 0.0, "the end of the dead motor's command")
     bench.drive(lambda: bench.status("motors").level != DiagnosticStatus.OK, "the reason")
     assert "rear_left" in bench.status("motors").message
+
+
+def test_wheel_speeds_in_another_unit_are_named(start_pair) -> None:
+    bench = start_pair().bench
+    bench.connect()
+    bench.drive(lambda: bench.mode() == 1 and bench.status("sensors").level == DiagnosticStatus.OK, "believed sensors")
+    rpm_as_radps = (10.0 / 0.33 * 9.55,) * 4
+    bench.drive(lambda: bench.status("sensors").level != DiagnosticStatus.OK, "the reason", wheels=rpm_as_radps)
+    assert "not believed: contradicts the others" in bench.status("sensors").message
 
 
 class TestParameters:
