@@ -329,6 +329,10 @@ class PowerManager(Starting):
         """Hand changed values to the controller; torque follows within the law's own rate limits."""
         new = {parameter.name: parameter.value for parameter in parameters if parameter.name in config.BY_NAME}
         self._values |= new
+        for name, value in new.items():
+            idle = name == "friction" and self._values["friction_source"] != "parameter"
+            remark = f" (no effect while friction_source is {self._values['friction_source']})" if idle else ""
+            self.get_logger().info(f"parameter {name} is {value} now{remark}")
         if new and self._controller and self._policies:
             if "strategy" in new:
                 self._policies.strategy = new["strategy"]

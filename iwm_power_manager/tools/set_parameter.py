@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import sys
 import time
 from collections.abc import Sequence
@@ -44,26 +45,41 @@ class _Remote:
         """Values of parameters; of all for no name."""
         from rclpy.parameter import parameter_value_to_python
 
-        wanted = list(names) or sorted(self._answer(self._parameters.list_parameters()).result.names)
+        known = sorted(self._answer(self._parameters.list_parameters()).result.names)
+        for name in names:
+            if name not in known:
+                near = difflib.get_close_matches(name, known)
+                hint = f"; did you mean {' or '.join(near)}?" if near else ""
+                raise IwmError(f"{self._name}: {name}: no such parameter{hint}")
+        wanted = list(names) or known
         values = self._answer(self._parameters.get_parameters(wanted)).values
         return {name: parameter_value_to_python(value) for name, value in zip(wanted, values, strict=True)}
 
     def set(self, assignments: Sequence[str]) -> None:
-        """Set parameters, each given as NAME=VALUE in YAML; all or, with the reason, `IwmError`."""
-        from rcl_interfaces.msg import Parameter
+        """Set parameters, each NAME=VALUE in YAML; print what they were and are, or `IwmError` with the reason."""
+        from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
         from rclpy.parameter import get_parameter_value
 
-        parameters = []
+        given = {}
         for assignment in assignments:
             name, equals, text = assignment.partition("=")
             if not (name and equals):
                 raise IwmError(f"{assignment!r} is not allowed; allowed: NAME=VALUE")
-            parameters.append(Parameter(name=name, value=get_parameter_value(text)))
+            given[name] = text
+        now = self.values(list(given))
+        parameters = []
+        for name, text in given.items():
+            value = get_parameter_value(text)
+            if isinstance(now[name], float) and value.type == ParameterType.PARAMETER_INTEGER:
+                value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=float(value.integer_value))
+            parameters.append(Parameter(name=name, value=value))
         for parameter, result in zip(
             parameters, self._answer(self._parameters.set_parameters(parameters)).results, strict=True
         ):
             if not result.successful:
                 raise IwmError(f"{self._name}: {parameter.name}: {result.reason or 'refused'}")
+        for name, value in self.values(list(given)).items():
+            print(f"{name}: {now[name]} -> {value}")
 
     def change(self, transition: str) -> None:
         """Ask for a lifecycle transition; `IwmError` if it is refused."""
@@ -79,10 +95,11 @@ class _Remote:
 
 _EXAMPLES = """\
 examples:
-  All parameters, one of them, and another value for it:
+  All parameters, one of them, and other values:
     set_parameter
     set_parameter friction
-    set_parameter friction=0.5
+    set_parameter strategy=equal
+    set_parameter friction_source=parameter friction=0.5
   A node in a namespace shall command nothing any more:
     set_parameter --node /car_1/power_manager --transition deactivate
 

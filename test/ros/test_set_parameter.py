@@ -29,8 +29,10 @@ def run(pair, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def test_values_are_read_and_set_and_a_transition_is_made(pair) -> None:
     assert run(pair, "friction", "strategy").stdout == "friction: 0.9\nstrategy: equal\n"
-    done = run(pair, "friction=0.4", "friction", "--transition", "configure")
-    assert (done.returncode, done.stdout) == (0, "friction: 0.4\n")
+    done = run(pair, "friction=1", "friction=0.4", "strategy=rule", "--transition", "configure")
+    assert (done.returncode, done.stdout) == (0, "friction: 0.9 -> 0.4\nstrategy: equal -> rule\n")
+    done = run(pair, "friction=1")
+    assert (done.returncode, done.stdout) == (0, "friction: 0.4 -> 1.0\n")
     assert pair.bench.lifecycle_state() == "inactive"
 
 
@@ -39,7 +41,7 @@ def test_values_are_read_and_set_and_a_transition_is_made(pair) -> None:
     [
         ("friction=7.0", "friction"),
         ("=3", "'=3' is not allowed; allowed: NAME=VALUE"),
-        ("frictoin=0.3", "frictoin"),
+        ("frictoin=0.3", "frictoin: no such parameter; did you mean friction"),
     ],
 )
 def test_what_is_refused_is_one_line(pair, argument: str, problem: str) -> None:
