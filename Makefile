@@ -74,7 +74,9 @@ mutation: setup-dev  ## Mutate the same modules: do the tests notice?
 	@$(BIN)/python scripts/mutation $(ARGS)
 
 ##@ Parts
-.PHONY: lint type format sbom build clean setup-run setup-dev help
+.PHONY: setup lint type format sbom build clean setup-run setup-dev help
+setup: setup-dev  ## Only set up: .venv with everything that demo, tests, docs and watch_car need (3 min)
+
 lint: setup-dev  ## ruff: style, docstrings, likely mistakes; import-linter: the layers
 	@$(BIN)/ruff check .
 	@$(BIN)/lint-imports --no-logo 2> /dev/null || $(BIN)/lint-imports
