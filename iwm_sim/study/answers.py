@@ -61,8 +61,9 @@ def _holds(study: Study) -> str:
         f"Not in its numbers. Of its {len(printed)} printed savings, {possible['none']} are possible here if an idle "
         f"axle costs nothing, {possible['drag']} if it drags. Their mean of {made.mean_saving_percent:.2f} % hangs on "
         f"one cell, NYCC on ice; without that it is {made.mean_saving_without_nycc_on_ice_percent:.2f} %. Its "
-        f"depletions mean {min(made.wh_per_km.values()):.0f} to {max(made.wh_per_km.values()):.0f} Wh/km, more than "
-        "its motors can give. Its idea holds: letting one axle rest saves energy where an idle axle costs little, and "
+        f"depletions mean {min(made.wh_per_km.values()):.0f} to {max(made.wh_per_km.values()):.0f} Wh/km, on HWFET "
+        "a mean power that its motors cannot give. Its idea holds: letting one axle rest saves energy where an idle "
+        "axle costs little, and "
         "avoiding skids ends locked wheels."
     )
 

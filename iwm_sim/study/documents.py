@@ -104,7 +104,8 @@ def energy(study: Study) -> str:
     wh = study.paper.wh_per_km.values()
     return (
         f"- **The paper's ΔSoC are not reproducible in absolute terms**: they imply {min(wh):.0f} to {max(wh):.0f} "
-        f"Wh/km, more than its motors can give. This car needs {min(needs):.0f} to {max(needs):.0f} Wh/km, by cycle "
+        f"Wh/km, on HWFET a mean power that its motors cannot give. This car needs {min(needs):.0f} to "
+        f"{max(needs):.0f} Wh/km, by cycle "
         "and road."
     )
 
