@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from iwm_power_manager.control.controller import Controller
-from iwm_power_manager.control.inputs import Violation
+from iwm_power_manager.control.inputs import Violation, WheelVerdict
 from iwm_power_manager.control.monitor import BATTERY, DEMAND, FRICTION, SPEED, WHEELS
 from iwm_power_manager.control.supervision import MODE_DEGRADED, MODE_NORMAL, MODE_WAITING, STALE_NAMES
 from iwm_power_manager.nodes.preparation import COMPILING_S, Prepared
@@ -100,7 +100,11 @@ class Announcements:
         self._problems = set(found)
 
     def stepped(
-        self, controller: Controller, topics: Mapping[str, tuple[str, ...]], trouble: Mapping[str, str]
+        self,
+        controller: Controller,
+        topics: Mapping[str, tuple[str, ...]],
+        trouble: Mapping[str, str],
+        wheel_names: Sequence[str],
     ) -> None:
         """Tell what has changed since the last call, while active.
 
@@ -109,6 +113,7 @@ class Announcements:
         controller : with its monitor
         topics : of each input
         trouble : why a topic is not heard, by topic
+        wheel_names : the wheels in their order
         """
         mode, stale = controller.supervision.mode, controller.supervision.stale
         if not self._torque_seen and controller.command and any(controller.command.motor_torque_nm):
@@ -123,8 +128,16 @@ class Announcements:
             self._logger.warning(f"degraded, motor torque fades: {missing}")
         elif mode == MODE_NORMAL and mode != self._mode:
             self._logger.info(f"{'recovered' if self._was_degraded else 'all inputs are there'}: normal operation")
+        if mode == MODE_NORMAL:
+            self._lost_wheels(controller, wheel_names)
         self._was_degraded |= mode == MODE_DEGRADED
         self._mode, self._stale = mode, stale
+
+    def _lost_wheels(self, controller: Controller, wheel_names: Sequence[str]) -> None:
+        for name, verdict in zip(wheel_names, controller.monitor.verdicts, strict=True):
+            if verdict is not WheelVerdict.GOOD and self._due(f"wheel {name}"):
+                found = verdict.name.lower().replace("_", " ")
+                self._logger.warning(f"wheel {name} is not believed ({found}): goes on with the others")
 
     def _missing(
         self,

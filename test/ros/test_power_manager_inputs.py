@@ -233,6 +233,16 @@ def test_wheel_speeds_in_another_unit_are_named(start_pair) -> None:
     assert "not believed: contradicts the others" in bench.status("sensors").message
 
 
+def test_a_wheel_that_never_comes_is_named_while_the_others_drive(start_pair) -> None:
+    pair = start_pair()
+    pair.bench.connect()
+    three = (10.0 / 0.33, 10.0 / 0.33, NAN, 10.0 / 0.33)
+    pair.bench.drive(lambda: pair.bench.mode() == 1, "normal operation", wheels=three)
+    named = "wheel rear_left is not believed (absent)"
+    pair.bench.drive(lambda: named in pair.running.text(), "its name in the log", wheels=three)
+    assert "wheel rear_right" not in pair.running.text()
+
+
 class TestParameters:
     @pytest.mark.parametrize(
         ("name", "value"),
