@@ -152,7 +152,7 @@ def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread,
     """Hear state and diagnostics in a thread: the node, the thread, and its executor."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.executors import ExternalShutdownException, InvalidHandle, SingleThreadedExecutor
     from rclpy.node import Node
     from rclpy.signals import SignalHandlerOptions
     from sensor_msgs.msg import JointState
@@ -166,8 +166,13 @@ def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread,
         JointState, POWER_MANAGER_STATE, lambda message: feed.state(*messages.read_named_numbers(message)), asked
     )
 
+    namespace = node.get_namespace()
+    of_this_car = "" if namespace == "/" else f"{namespace}/"
+
     def diagnosed(message: DiagnosticArray) -> None:
         for status in message.status:
+            if not status.name.startswith(of_this_car):
+                continue
             feed.status(status.name, status.level[0], status.message)
 
     node.create_subscription(DiagnosticArray, DIAGNOSTICS, diagnosed, asked)
@@ -175,7 +180,7 @@ def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread,
     executor.add_node(node)
 
     def spin() -> None:
-        with suppress(ExternalShutdownException):
+        with suppress(ExternalShutdownException, InvalidHandle):  # the end may come while it waits
             executor.spin()
 
     thread = threading.Thread(target=spin, name="topics", daemon=True)

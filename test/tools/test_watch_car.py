@@ -127,10 +127,11 @@ state = node.create_publisher(JointState, "~/state", 10)
 diagnostics = node.create_publisher(DiagnosticArray, sys.argv[1] + "/diagnostics", 10)
 values = dict.fromkeys(SIGNAL_NAMES, 0.0) | {"speed_mps": 12.5, "mode": 1.0}
 status = DiagnosticStatus(level=b"\\x01", name=node.get_fully_qualified_name() + ": control", message="a word")
+other = DiagnosticStatus(level=b"\\x02", name="/another_car/power_manager: control", message="not of this car")
 for i in range(10**9):
     state.publish(messages.named_numbers_message(i * 10**7, list(values), list(values.values())))
     if i % 20 == 0:
-        diagnostics.publish(DiagnosticArray(status=[status]))
+        diagnostics.publish(DiagnosticArray(status=[other, status]))
     time.sleep(0.01)
 """
 
