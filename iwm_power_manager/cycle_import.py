@@ -103,11 +103,11 @@ def read_log(
     table = read_table(path, separator, decimal)
     line, header = table.rows[0]
     columns = {
-        "time": _column(table, header, time, r"time|stamp|\bt\b|zeit"),
-        "speed": _column(table, header, speed, r"speed|veloc|\bv\b|geschw|vitesse"),
+        "time": _column(table, header, "time", time, r"time|stamp|\bt(?![a-z0-9])|zeit"),
+        "speed": _column(table, header, "speed", speed, r"speed|veloc|\bv(?![a-z0-9])|geschw|vitesse"),
     }
     if grade:
-        columns["grade"] = _column(table, header, grade, "")
+        columns["grade"] = _column(table, header, "grade", grade, "")
     said = [f"columns: {', '.join(f'{name} is {header[i]!r}' for name, i in columns.items())}"]
     if table.decimal == ",":
         said.append("decimal commas")
@@ -147,10 +147,10 @@ def read_log(
     return _in_si(path, arrays, header, columns, "clock" if clock else time_unit, speed_unit, said)
 
 
-def _column(table: Table, header: list[str], name: str, pattern: str) -> int:
+def _column(table: Table, header: list[str], what: str, name: str, pattern: str) -> int:
     wanted = [i for i, cell in enumerate(header) if (cell == name if name else re.search(pattern, cell, re.IGNORECASE))]
     if not wanted:
-        problem = f"has no column {name!r}" if name else "has no column that looks like it: name it"
+        problem = f"has no column {name!r}" if name else f"has no column that looks like {what}: name it with --{what}"
         raise ConfigError(table.path, "line 1", problem, ", ".join(header))
     return wanted[0]
 

@@ -113,7 +113,8 @@ def test_a_trace_the_car_cannot_follow_is_warned_of(tmp_path, capsys):
     [
         ("", "is empty"),
         ("time,speed\n0,0\n", "has 1 usable rows"),
-        ("a,b\n0,0\n1,1\n", "has no column that looks like it: name it; allowed: a, b"),
+        ("a,b\n0,0\n1,1\n", "has no column that looks like time: name it with --time; allowed: a, b"),
+        ("Zeit_s;w\n0;0\n1;1\n", "has no column that looks like speed: name it with --speed; allowed: Zeit_s, w"),
         ("time_s,speed m/s\n0,0\n1,fast\n", "line 3, speed m/s: 'fast' is no number"),
         ("time_s,speed m/s\n0,0\n1,-9\n", "driving backwards is no cycle"),
         ("time_s,speed m/s\n0,0\n1,60\n", "no car does"),
