@@ -54,10 +54,10 @@ bench-peers: setup-dev  ## FASTSim in an environment of its own, runs/peers: a p
 ##@ Safety
 .PHONY: faults soak nightly coverage mutation
 faults: setup-run  ## Fault campaign over DDS with the simulator in the loop
-	@$(BIN)/python -m iwm_sim.campaigns.faults $(ARGS)
+	@$(BIN)/python -m campaigns.faults $(ARGS)
 
 soak: setup-dev  ## 30 minutes in real time at 100 Hz: memory, deadlines, counts
-	@$(BIN)/python -m iwm_sim.campaigns.soak $(ARGS)
+	@$(BIN)/python -m campaigns.soak $(ARGS)
 
 nightly: setup-dev  ## The tests that are too long for every run, and far more random cases in the others
 	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest -m "nightly or not nightly" $(PYTEST_ARGS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 
-from iwm_sim.campaigns.latency import main
+from campaigns.latency import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -13,11 +13,11 @@ import pytest
 from rclpy.serialization import serialize_message
 
 from bags_helpers import TWIST, topic, twist
+from campaigns import fault_relay as relay
+from campaigns import faults, soak
+from campaigns.witness import Look, Witness
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.ros import messages as m
-from iwm_sim.campaigns import fault_relay as relay
-from iwm_sim.campaigns import faults, soak
-from iwm_sim.campaigns.witness import Look, Witness
 from iwm_sim.dds_drive import node_command
 
 WHEELS = m.wheel_states_message(5, m.WHEEL_NAMES, (1.0, 2.0, 3.0, 4.0), (5.0, 6.0, 7.0, 8.0))

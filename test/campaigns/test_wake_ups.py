@@ -9,8 +9,8 @@ import time
 import numpy as np
 import pytest
 
+from campaigns import wake_ups, witness
 from iwm_power_manager.errors import IwmError
-from iwm_sim.campaigns import wake_ups, witness
 
 TICK_NS = 1_000_000
 

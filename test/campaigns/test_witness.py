@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iwm_sim.campaigns import soak
-from iwm_sim.campaigns.witness import Look, Stall, Witness, overlap_s
+from campaigns import soak
+from campaigns.witness import Look, Stall, Witness, overlap_s
 
 #: Wants the processor it is given all the time.
 BUSY = "import os, sys; os.sched_setaffinity(0, {int(sys.argv[1])})\nwhile True: pass"

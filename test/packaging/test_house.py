@@ -20,7 +20,7 @@ def sources(*folders: str) -> list[Path]:
     return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
 
 
-@pytest.mark.parametrize("folder", ["iwm_power_manager", "iwm_sim"])
+@pytest.mark.parametrize("folder", ["iwm_power_manager", "iwm_sim", "campaigns"])
 def test_no_function_is_longer_than_a_screen_or_two(folder) -> None:
     long = [
         f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"

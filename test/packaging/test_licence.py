@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 def test_every_source_carries_the_licence_identifier() -> None:
     sources = sorted(
         path
-        for folder in ("iwm_power_manager", "iwm_sim", "test", "benchmarks", "launch", "examples")
+        for folder in ("iwm_power_manager", "iwm_sim", "campaigns", "test", "benchmarks", "launch", "examples")
         for path in (ROOT / folder).rglob("*.py")
         if path.stat().st_size
     )

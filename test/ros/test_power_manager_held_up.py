@@ -15,9 +15,9 @@ from typing import NamedTuple
 import pytest
 from rolling_car import Heard, RollingCar
 
+from campaigns import soak
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.control.thresholds import Thresholds
-from iwm_sim.campaigns import soak
 
 T = Thresholds()
 #: Shared memory of Fast DDS does not survive that a process is stopped for a second: see docs/safety.md.

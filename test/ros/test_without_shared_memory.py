@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bench import Bench, Running, arguments
 
-from iwm_sim.campaigns import soak
+from campaigns import soak
 
 
 def test_it_drives_and_is_heard_without_shared_memory(tmp_path: Path, compiled_law: None) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m iwm_sim.campaigns.soak`: half an hour in real time at 100 Hz; memory, deadlines and counts.
+"""`python -m campaigns.soak`: half an hour in real time at 100 Hz; memory, deadlines and counts.
 
 Simulator, power manager and recorder run as in a car. Meanwhile this process samples the memory of each, and a witness
 notes when the machine stood still or let the power manager wait: a late step that would have been in time without that
@@ -25,12 +25,12 @@ import numpy as np
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
+from campaigns.witness import Witness
 from iwm_power_manager import files
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.ros import messages as m
 from iwm_power_manager.share import share_path
-from iwm_sim.campaigns.witness import Witness
 from iwm_sim.dds_drive import environment, node_command
 from iwm_sim.domains import claimed_domain
 from iwm_sim.drive import load_run

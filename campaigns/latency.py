@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m iwm_sim.campaigns.latency`: from inputs to command, beside a bare rclpy relay, in one run.
+"""`python -m campaigns.latency`: from inputs to command, beside a bare rclpy relay, in one run.
 
 Two processes answer: the power manager in lock-step (each set of inputs is answered at once: the whole control path,
 with no timer in it), and a relay that does nothing but receive the same four messages with plain callbacks and publish
@@ -209,7 +209,7 @@ def _run(chosen: argparse.Namespace, environment: Mapping[str, str], folder: Pat
     with Children(environment, folder) as children:
         relay = Questioner(node, "/relay")
         ticks = Questioner(node, "/relay", "ticks")
-        children.start("relay", [sys.executable, "-m", "iwm_sim.campaigns.latency", "--relay", "/relay"])
+        children.start("relay", [sys.executable, "-m", "campaigns.latency", "--relay", "/relay"])
         lockstep = Questioner(node, "/lockstep")
         children.start("lockstep", [*manager, "-p", "lockstep:=true", "-r", "__ns:=/lockstep"])
         _wait(relay, lockstep)

@@ -32,8 +32,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from campaigns import wake_ups
 from iwm_power_manager.errors import IwmError
-from iwm_sim.campaigns import wake_ups
 
 _TICK_S = 0.0005
 #: Later than this is no ordinary wake-up: on an idle machine one of a thousand takes so long.
@@ -106,7 +106,7 @@ class Witness:
     def __enter__(self) -> Self:
         """Begin to watch."""
         for what in (*(("processor", number) for number in self._processors), ("process", self._pid)):
-            command = [sys.executable, "-m", "iwm_sim.campaigns.witness", *map(str, what)]
+            command = [sys.executable, "-m", "campaigns.witness", *map(str, what)]
             self.processes.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
         for process in self.processes:
             assert process.stdout is not None
@@ -274,7 +274,7 @@ def _watch_process(pid: int, stopped: Callable[[], bool]) -> array[float]:
 
 
 def _main() -> None:
-    """`python -m iwm_sim.campaigns.witness processor|process NUMBER`: watch until the input ends, then tell."""
+    """`python -m campaigns.witness processor|process NUMBER`: watch until the input ends, then tell."""
     kind, number = sys.argv[1], int(sys.argv[2])
     gc.disable()
     ended = threading.Event()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`python -m iwm_sim.campaigns.faults`: break one thing after the other in a simulated drive, and see what happens.
+"""`python -m campaigns.faults`: break one thing after the other in a simulated drive, and see what happens.
 
 Simulator and power manager run as processes of their own, in real time, over DDS. Between them stands a relay that can
 spoil every input (`fault_relay`). For each fault the table says how long it took to zero torque, the largest torque
@@ -26,6 +26,8 @@ from typing import Any, NamedTuple
 
 import rclpy
 
+from campaigns import fault_relay as relay
+from campaigns.fault_relay import FaultRelay
 from iwm_power_manager import files
 from iwm_power_manager.control.supervision import MODE_NORMAL
 from iwm_power_manager.errors import IwmError
@@ -34,8 +36,6 @@ from iwm_power_manager.ros import ending
 from iwm_power_manager.ros import messages as m
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
-from iwm_sim.campaigns import fault_relay as relay
-from iwm_sim.campaigns.fault_relay import FaultRelay
 from iwm_sim.domains import claimed_domain
 from iwm_sim.processes import Child, Children
 
