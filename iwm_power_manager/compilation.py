@@ -14,6 +14,7 @@ from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numba
+from llvmlite.binding import Linkage
 from numba.core import config
 from numba.core.caching import NullCache
 from numba.core.codegen import JITCodeLibrary
@@ -136,6 +137,29 @@ def part(kernel: Kernel) -> CPUDispatcher:
     return _Part(kernel.py_func, targetoptions=_options(kernel) | _NO_WRAPPERS, pipeline_class=_PartCompiler)
 
 
+class _WholeCode(JITCodeLibrary):
+    """All code of an entry point.
+
+    Nobody else calls its parts, so that LLVM may suit them to their only callers: without what is not used of a car and
+    a policy, which are hundreds of numbers to copy at every call.
+    """
+
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            if function.linkage == Linkage.linkonce_odr:
+                function.linkage = Linkage.internal
+        super()._optimize_final_module()
+
+
+class _EntryCompiler(Compiler):
+    """Numba's compiler, for code that is called from Python only."""
+
+    def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, names: Any) -> None:
+        library = _WholeCode(target.codegen(), "entry")
+        library.enable_object_caching()
+        super().__init__(typing, target, library, args, result, flags, names)
+
+
 class _Entry(CPUDispatcher):
     """A kernel as Python calls it."""
 
@@ -152,7 +176,8 @@ class _Entry(CPUDispatcher):
 
 def entry_point(kernel: Kernel) -> CPUDispatcher:
     """A kernel as Python calls it."""
-    dispatcher = _Entry(kernel.py_func, targetoptions=_options(kernel) | {"no_cfunc_wrapper": True})
+    options = _options(kernel) | {"no_cfunc_wrapper": True}
+    dispatcher = _Entry(kernel.py_func, targetoptions=options, pipeline_class=_EntryCompiler)
     dispatcher._cache = _Cache(kernel)
     return dispatcher
 

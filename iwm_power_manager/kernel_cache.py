@@ -39,7 +39,7 @@ PACKAGES = frozenset({"iwm_power_manager", "iwm_sim"})
 #: Folders of installed libraries: their versions count, not their sources.
 _LIBRARIES = frozenset({"site-packages", "dist-packages"})
 #: Changed when the layout of a file changes.
-_FORMAT = "1"
+_FORMAT = "2"
 _SHA256_BYTES = 32
 #: Subfolder that kernels stand in.
 KERNELS = "kernels"
