@@ -7,6 +7,9 @@ it follows the forces, and each sensor may pull at it only as fast as a slope or
 leaves it, stands still while it moves, or contradicts four wheels that roll freely, is not believed until it has been
 near it again for a while. A believed speed sensor is taken as it is: on a healthy car this page changes nothing.
 
+The forces may be wrong too: a car on a dynamometer or a trailer, a gap in the messages. Five speeds that agree with
+each other where no slip can explain what they show are right, and the reference starts over from them.
+
 A wheel is not believed when it does what no torque can: slows down faster than its brake can, or stays away from the
 car's speed although nothing holds it. A wheel that skids does neither.
 """
@@ -49,6 +52,10 @@ ROLLING_FRICTION = 0.08
 #: Below the second torque or this speed, m/s, what they slip makes no wrong speed of them.
 NEARLY_FRICTION, NEARLY_MPS = 0.15, 4.0
 APART_PART, APART_MPS, APART_S = 0.05, 0.5, 0.1
+#: Five speeds that agree against the reference are right after `APART_S`; after this long where their torque could make
+#: wheels slip that way. Below the speed they stand, which a dead control unit shows too.
+AGREED_S = 1.0
+STANDING_MPS = 0.1
 #: A sensor must have been near the reference for this long before it is believed again.
 DISTRUST_S = 0.5
 #: Noise of a wheel's change in one step, rad/s; what a torque explains is taken times `TORQUE_MARGIN`.
@@ -194,6 +201,11 @@ def _rolling(rims: Wheels, doubt_s: Wheels, turning: _Turning) -> _Rolling:
     return _Rolling(count, low, high, mean, agree and used < ROLLING_FRICTION, nearly)
 
 
+@kernel
+def _confirmed(shown: float, rolling: _Rolling) -> bool:
+    return rolling.believed >= 3 and abs(shown - rolling.mean_mps) <= CONFIRMED_PART * abs(shown) + CONFIRMED_MPS
+
+
 class _Sensor(NamedTuple):
     """The speed sensor after judgement: as in `MotionState`, with the speed that is predicted now."""
 
@@ -223,7 +235,9 @@ def _judge_speed(
     error = abs(shown - predicted)
     far = error > tolerance and abs(predicted) > SLOW_MPS
     doubt = before.doubt_s
-    if far or apart > APART_S or (shown_s > STUCK_S and abs(moved) > STUCK_MPS):
+    # Where the wheels show the same it is the car that keeps its speed.
+    stuck = shown_s > STUCK_S and abs(moved) > STUCK_MPS and not _confirmed(shown, rolling)
+    if far or apart > APART_S or stuck:
         doubt = DISTRUST_S
     elif error <= 0.5 * tolerance:
         doubt = max(doubt - dt, 0.0)
@@ -281,7 +295,7 @@ def _started(shown: float, rims: Wheels) -> MotionState:
     start = _middle(rims)
     if not math.isnan(shown) and abs(shown - start) <= SPEED_PART * abs(start) + SPEED_MPS:
         start = shown
-    return MotionState(start, 0.0, shown, 0.0, 0.0, 0.0, 0.0, NO_WHEELS, NO_WHEELS)
+    return MotionState(start, 0.0, shown, 0.0, 0.0, 0.0, 0.0, NO_WHEELS, NO_WHEELS, 0.0)
 
 
 class _Turning(NamedTuple):
@@ -333,6 +347,39 @@ def _turning(
         _road_nm(torque[3], change[3], dt, doubt_s[3] > 0.0, rear.inertia_kgm2, rear_nm),
     )
     return _Turning(torque, change, road, (a.gated, b.gated, c.gated, d.gated), front_nm, rear_nm)
+
+
+@kernel
+def _agreed(
+    shown: float, rims: Wheels, predicted: float, t: _Turning, before: MotionState, dt: float
+) -> tuple[float, bool]:
+    """How long all five have agreed against the reference by now, and whether they are right.
+
+    Wheels that stand say nothing: a dead control unit shows zeros too.
+    """
+    doubt = before.wheel_doubt_s
+    all_doubted = min(doubt[0], doubt[1], doubt[2], doubt[3]) > 0.0
+    mean = _middle(rims)
+    spread = AGREE_PART * abs(mean) + AGREE_MPS
+    together = max(rims[0], rims[1], rims[2], rims[3]) - min(rims[0], rims[1], rims[2], rims[3]) <= spread
+    # Without a sensor wheels that are believed lead the reference by themselves.
+    confirmed = all_doubted if math.isnan(shown) else abs(shown - mean) <= spread
+    near = abs(mean - predicted) <= SPEED_PART * abs(mean) + SPEED_MPS
+    if near or not (together and confirmed) or abs(mean) <= STANDING_MPS:
+        return 0.0, False
+    torque = t.torque_nm
+    front, rear = max(abs(torque[0]), abs(torque[1])), max(abs(torque[2]), abs(torque[3]))
+    # A driven wheel is never slower than the car, a braked one never faster; no skid makes a wheel doubted.
+    slip = (torque[0] + torque[1] + torque[2] + torque[3]) * (mean - predicted) > 0.0
+    slip = slip and not (all_doubted and max(front / t.front_nm, rear / t.rear_nm) < ROLLING_FRICTION)
+    agreed = before.agreed_s + dt
+    return agreed, agreed > (AGREED_S if slip else APART_S)
+
+
+@kernel
+def _restarted(mean: float, shown: float, before: MotionState) -> MotionState:
+    """The reference from five speeds that are right; what the forces did not explain stays."""
+    return MotionState(mean, before.bias_mps2, shown, 0.0, 0.0, 0.0, 0.0, NO_WHEELS, NO_WHEELS, 0.0)
 
 
 @kernel
@@ -394,8 +441,7 @@ def _bias_mps2(before: float, shown: float, predicted: float, trusted: bool, rol
     """What the forces do not explain of a speed that is believed."""
     if not (trusted and abs(predicted) > SLOW_MPS):
         return before
-    confirmed = abs(shown - rolling.mean_mps) <= CONFIRMED_PART * abs(shown) + CONFIRMED_MPS
-    gain = CONFIRMED_GAIN_PER_S2 if confirmed and rolling.believed >= 3 else BIAS_GAIN_PER_S2
+    gain = CONFIRMED_GAIN_PER_S2 if _confirmed(shown, rolling) else BIAS_GAIN_PER_S2
     step = gain * _clamped(shown - predicted, BIAS_STEP_MPS) * dt
     return _clamped(before + step, BIAS_MPS2)
 
@@ -432,6 +478,11 @@ def estimate(
     if abs(before.speed_mps) > SLOW_MPS and not first:
         acceleration = forces - _resistance_mps2(before.speed_mps, vehicle) + before.bias_mps2
     predicted = before.speed_mps + acceleration * dt
+    agreed, right = _agreed(shown, rims, predicted, turning, before, dt)
+    if right:
+        predicted = _middle(rims)
+        before = _restarted(predicted, shown, before)
+        agreed = 0.0
     stray, doubt = _doubts(w, turning, predicted, acceleration, dt, before.wheel_stray_s, before.wheel_doubt_s, vehicle)
     rolling = _rolling(rims, doubt, turning)
     sensor = _judge_speed(shown, predicted, acceleration, dt, before, rolling)
@@ -465,6 +516,7 @@ def estimate(
         doubt_s=sensor.doubt_s,
         wheel_stray_s=stray,
         wheel_doubt_s=doubt,
+        agreed_s=agreed,
     )
     return motion, after
 

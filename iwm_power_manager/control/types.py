@@ -173,6 +173,7 @@ class MotionState(NamedTuple):
     doubt_s : time the speed sensor has yet to be good; 0 is believed
     wheel_stray_s : how long each wheel has stayed away although nothing holds it
     wheel_doubt_s : time each wheel has yet to be good
+    agreed_s : how long all five speeds have agreed with each other and not with the reference
     """
 
     speed_mps: float
@@ -184,6 +185,7 @@ class MotionState(NamedTuple):
     doubt_s: float
     wheel_stray_s: Wheels
     wheel_doubt_s: Wheels
+    agreed_s: float
 
 
 class WheelGrip(NamedTuple):
@@ -295,6 +297,7 @@ def initial_state() -> ControllerState:
             doubt_s=0.0,
             wheel_stray_s=none,
             wheel_doubt_s=none,
+            agreed_s=0.0,
         ),
         travel=1.0,
         hold_nm=0.0,

@@ -218,3 +218,64 @@ def test_a_sensor_that_walked_away_leaves_no_wrong_speed_behind(rate):
             break
     assert motion.doubted == DOUBT_SPEED
     assert motion.speed_mps == pytest.approx(car.v, abs=0.15)
+
+
+@pytest.mark.parametrize("torque", [-300.0, -100.0, -20.0, 0.0, 33.0, 200.0])
+@pytest.mark.parametrize(("before", "after"), [(0.0, 20.0), (3.0, 14.0), (10.0, 0.6), (20.0, 12.0), (14.0, 30.0)])
+def test_five_speeds_that_agree_after_a_gap_are_right_within_two_seconds(before, after, torque):
+    car = Car(before)
+    for _ in range(100):
+        car.step(0.0)
+    car.v, car.rim = after, [after / RADIUS] * 4
+    for _ in range(165):
+        motion = car.step(torque)
+    assert motion.doubted == 0 or car.v < 1.0
+    assert motion.speed_mps == pytest.approx(car.v, abs=0.3)
+
+
+@pytest.mark.parametrize("torque", [-100.0, 33.0, 100.0, 200.0])
+def test_a_car_held_at_its_speed_under_torque_is_believed(torque):
+    car = Car(10.0)  # a dynamometer in speed control, a trailer, a steeper slope than any road
+    speeds, doubted = [], 0
+    for _ in range(1000):
+        motion = car.step(torque)
+        car.v, car.rim = 10.0, [10.0 / RADIUS] * 4
+        speeds.append(motion.speed_mps)
+        doubted = motion.doubted
+    assert doubted == 0
+    assert max(abs(v - 10.0) for v in speeds) < 2.0
+    assert speeds[-1] == 10.0
+
+
+@pytest.mark.parametrize("shown", [lambda v: v, lambda v: math.nan])
+def test_wheels_that_are_all_doubted_are_right_again_when_nothing_makes_them_slip(shown):
+    car = Car(10.0)
+    car.step(0.0)
+    car.state = car.state._replace(
+        motion=car.state.motion._replace(speed_mps=14.0, wheel_doubt_s=(0.5,) * 4, doubt_s=0.5)
+    )
+    for _ in range(70):
+        motion = car.step(33.0, shown)
+    assert motion.doubted in (0, DOUBT_SPEED)
+    assert motion.speed_mps == pytest.approx(car.v, abs=0.2)
+
+
+def test_zeros_of_a_dead_control_unit_do_not_stop_the_car():
+    car = Car(20.0)
+    for _ in range(50):
+        car.step(-50.0)
+    for _ in range(300):
+        motion = car.step(-50.0, lambda v: 0.0, lambda w: [0.0] * 4)
+    assert motion.doubted == 31
+    assert motion.speed_mps == pytest.approx(car.v, abs=1.0)
+
+
+def test_wheels_that_skid_on_ice_are_not_right_because_the_sensor_repeats_them():
+    """The speed of many stacks is made from the wheels: for a second that changes nothing."""
+    car = Car(20.0)
+    for _ in range(50):
+        car.step(0.0)
+    for k in range(90):
+        skid = max(0.6, 1.0 - 0.02 * k)
+        motion = car.step(-60.0, lambda v, k=skid: k * v, wheels=lambda v, k=skid: [k * v / RADIUS] * 4)
+    assert motion.speed_mps > 0.9 * car.v
