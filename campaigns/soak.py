@@ -30,7 +30,6 @@ from iwm_power_manager import files
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.ros import messages as m
-from iwm_power_manager.share import share_path
 from iwm_sim.dds_drive import environment, node_command
 from iwm_sim.domains import claimed_domain
 from iwm_sim.drive import load_run
@@ -39,7 +38,6 @@ from iwm_sim.processes import Child, ChildError, Children
 _RATE_HZ = 100.0
 _PERIOD_S = 1.0 / _RATE_HZ
 _SAMPLE_S = 5.0
-_PROFILE = "config/dds/without_shared_memory.xml"
 #: How Fast DDS begins the names of memory that processes share.
 _SHARED = "/fastrtps_"
 #: Memory is compared from here on: until then caches fill.
@@ -170,20 +168,6 @@ def shares_memory(pid: int) -> bool:
         return False
 
 
-def without_shared_memory(environment: Mapping[str, str]) -> dict[str, str]:
-    """Give an environment in which nodes on this computer talk over UDP only.
-
-    With the discovery range LOCALHOST rmw would bring its own transports, shared memory among them.
-    """
-    profile = str(share_path(_PROFILE))
-    return {
-        **environment,
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT",
-        "FASTRTPS_DEFAULT_PROFILES_FILE": profile,
-        "FASTDDS_DEFAULT_PROFILES_FILE": profile,
-    }
-
-
 def growth_percent(samples_kb: Sequence[int]) -> float:
     """Growth from the median of the first settled fifth to that of the last, %."""
     settled = samples_kb[int(len(samples_kb) * _SETTLED) :]
@@ -242,7 +226,7 @@ def drive(minutes: float, priority: int, processor: int | None, folder: Path) ->
     with (
         kept_off(processor),
         claimed_domain() as domain,
-        Children(without_shared_memory(environment(folder, domain)), folder) as children,
+        Children(environment(folder, domain), folder) as children,
     ):
         bag, result = folder / "bag", folder / "drive.npz"
         recorder = children.start("recorder", node_command("recorder", {"output": str(bag)}))

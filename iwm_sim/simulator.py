@@ -460,6 +460,7 @@ def main(args: Sequence[str] | None = None) -> int:
         # rclpy's own handlers would close DDS under a callback that is publishing.
         rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
         node = Simulator()
+        check_parameter_files(sys.argv if args is None else list(args), node.get_fully_qualified_name())
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         interruption.started = True

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -121,12 +121,21 @@ class Tally:
     dropped : by reason
     accepted_ns : time of the last accepted one: its stamp, or when it was received if it has none (None: none yet)
     violation : why the last message was dropped, or was accepted with a reservation
+    describe : says more of a message that was out of range, "" for nothing
     """
 
     received: int = 0
     dropped: Counter[Violation] = field(default_factory=Counter)
     accepted_ns: int | None = None
     violation: Violation = Violation.NONE
+    describe: Callable[[], str] = str
+
+    def why(self) -> str:
+        """What was wrong with the last message, in words; "" if nothing was."""
+        if self.violation is Violation.NONE:
+            return ""
+        more = self.describe() if self.violation is Violation.OUT_OF_RANGE else ""
+        return self.violation.name.lower().replace("_", " ") + (f": {more}" if more else "")
 
     def age_s(self, now_ns: int) -> float:
         """Time since the last accepted message; infinite before the first."""

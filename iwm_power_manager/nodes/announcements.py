@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from iwm_power_manager.control.controller import Controller
-from iwm_power_manager.control.inputs import Violation, WheelVerdict
+from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import BATTERY, DEMAND, FRICTION, SPEED, WHEELS
 from iwm_power_manager.control.supervision import MODE_DEGRADED, MODE_NORMAL, MODE_WAITING, STALE_NAMES
 from iwm_power_manager.nodes.preparation import COMPILING_S, Prepared
@@ -16,6 +16,8 @@ from iwm_power_manager.signals import mapping
 
 #: What the node waits for is said again after this time.
 REPEAT_S = 5.0
+#: A car that starts or dies changes what is there several times within this time.
+SETTLED_S = 0.9
 
 #: What there is to say of an input that is back already.
 _FOR_A_MOMENT = "an input came late; is input_period_s the period your stack has?"
@@ -49,6 +51,7 @@ class Announcements:
         self._logger = logger
         self._said: dict[str, float] = {}
         self._problems: set[str] = set()
+        self._found_s: dict[str, float] = {}
         self.activated()
 
     def activated(self) -> None:
@@ -89,15 +92,21 @@ class Announcements:
     def held_up(self) -> None:
         """Tell that the process itself was late."""
         self._mode = MODE_WAITING
+        self._said["waiting"] = time.monotonic() - REPEAT_S + 1.0
         if self._due("held up"):
             self._logger.warning("this process was held up: it starts over, as after activation (own_gap_s)")
 
     def problems(self, found: list[str]) -> None:
-        """Tell each endpoint that does not fit, once as long as it is there."""
-        for line in found:
-            if line not in self._problems:
+        """Tell what is wrong with other endpoints, each line once it has stood for a moment, and that it is over."""
+        now = time.monotonic()
+        self._found_s = {line: self._found_s.get(line, now) for line in found}
+        for line, since_s in self._found_s.items():
+            if line not in self._problems and now - since_s >= SETTLED_S:
                 self._logger.warning(line)
-        self._problems = set(found)
+                self._problems.add(line)
+        for line in sorted(self._problems.difference(found)):
+            self._logger.info(f"over: {line}")
+        self._problems.intersection_update(found)
 
     def stepped(
         self,
@@ -152,12 +161,13 @@ class Announcements:
             if not stale & bit or (stale == ~0 and tally.accepted_ns is not None):
                 continue
             found = topics.get(name, ())
-            reason = "; ".join(dict.fromkeys(trouble[topic] for topic in found if topic in trouble))
-            if not reason and tally.violation is not Violation.NONE:
-                reason = (
-                    f"{sum(tally.dropped.values())} messages refused, {tally.violation.name.lower().replace('_', ' ')}"
-                )
-            where = ", ".join(topic for topic in found if topic != name)
+            silent = tuple(topic for topic in found if topic in trouble)
+            reason = "; ".join(dict.fromkeys(trouble[topic] for topic in silent))
+            if not reason and tally.why():
+                reason = f"{sum(tally.dropped.values())} messages refused, {tally.why()}"
+            elif not reason and tally.received and tally.accepted_ns is None:
+                reason = "none since it started over"
+            where = ", ".join(topic for topic in silent or found if topic != name)
             parts.append(f"{name}" + (f" on {where}" if where else "") + (f" ({reason})" if reason else ""))
         return ", ".join(parts)
 

@@ -31,19 +31,38 @@ class Neighbours(NamedTuple):
 def look(node: Node, inputs: Inputs, outputs: Outputs) -> Neighbours:
     """Look at the graph as it is now."""
     types = inputs.types | outputs.types
-    counts = {topic: node.count_publishers(topic) for topic in outputs.topics}
-    others = [f"{topic} has {count} publishers" for topic, count in counts.items() if count > 1]
-    deaf = mismatched_subscribers(node, outputs.publishers, types)
-    problems = [*others, *(f"{topic}: {why}" for topic, why in deaf.items())]
-    values = {f"{topic}: publishers": str(count) for topic, count in counts.items()}
-    level = diagnostics.ERROR if problems else diagnostics.OK
-    statuses = [diagnostics.Status("command topics", level, "; ".join(problems) or "ok", values)]
-    mismatches = mismatched_publishers(node, inputs.subscriptions, types)
-    unheard = [f"{topic}: {why}" for topic, why in mismatches.items()]
+    commanders = {topic: node.count_publishers(topic) for topic in outputs.topics}
+    deaf = _lines(mismatched_subscribers(node, outputs.publishers, types))
+    wrong = [*_shared(commanders), *deaf]
+    values = {f"{topic}: publishers": str(count) for topic, count in commanders.items()}
+    level = diagnostics.ERROR if wrong else diagnostics.OK
+    statuses = [diagnostics.Status("command topics", level, "; ".join(wrong) or "ok", values)]
+    mismatches = mismatched_publishers(node, inputs.subscriptions, types, inputs.how_to_hear)
+    unheard = _lines(mismatches)
     senders = {found.topic_name: node.count_publishers(found.topic_name) for found in inputs.subscriptions}
-    several = [f"{topic} has {count} publishers" for topic, count in senders.items() if count > 1]
+    several = _shared(senders)
     if unheard or several:
         level = diagnostics.ERROR if unheard else diagnostics.WARN
         statuses.append(diagnostics.Status("input topics", level, "; ".join([*unheard, *several]), {}))
-    silent = {topic: "no publisher" for topic, count in senders.items() if not count}
-    return Neighbours(statuses, [*problems, *unheard, *several], silent | mismatches)
+    silent = {
+        topic: "no message" if count else "no publisher"
+        for topic, count in senders.items()
+        if not count or topic not in inputs.heard
+    }
+    return Neighbours(statuses, [*wrong, *unheard, *several], silent | mismatches)
+
+
+def _lines(reasons: dict[str, str]) -> list[str]:
+    return [f"{topic}: {why}" for topic, why in reasons.items()]
+
+
+def _shared(publishers: dict[str, int]) -> list[str]:
+    """A line for all topics that have the same number of publishers, which is more than one."""
+    by_count: dict[int, list[str]] = {}
+    for topic, count in publishers.items():
+        by_count.setdefault(count, []).append(topic)
+    return [
+        f"{', '.join(topics)} " + (f"have {count} publishers each" if len(topics) > 1 else f"has {count} publishers")
+        for count, topics in by_count.items()
+        if count > 1
+    ]

@@ -11,6 +11,7 @@ from iwm_power_manager.errors import IwmError
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.interruption import Interruption
+from iwm_power_manager.ros.transport import leave_shared_memory
 
 if TYPE_CHECKING:
     from iwm_power_manager.nodes.power_manager_node import PowerManager
@@ -61,8 +62,10 @@ def _run(interruption: Interruption, args: list[str] | None) -> int:
     node: PowerManager | None = None
     code = 1
     try:
+        leave_shared_memory(os.environ)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = PowerManager()
+        check_parameter_files(sys.argv if args is None else args, node.get_fully_qualified_name())
         interruption.started = True
         if node.get_parameter("autostart").value:
             node.start_when_prepared()

@@ -14,6 +14,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS, LockstepQueue
 from iwm_power_manager.control.monitor import BatteryReading, InputMonitor, JointReading, SpeedReading
+from iwm_power_manager.errors import BagError
 from iwm_power_manager.ros import messages, qos
 from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.signals.mapping import DEMANDS, PEDALS
@@ -23,7 +24,9 @@ from iwm_power_manager.signals.readings import (
     FrictionReading,
     TopicReader,
     TorqueReading,
+    field_like,
 )
+from iwm_power_manager.signals.types import types_of
 
 #: The queue of each stamped input of a lock-step set.
 _QUEUES: dict[type, int] = {SpeedReading: SPEED, JointReading: WHEELS, BatteryReading: BATTERY}
@@ -42,6 +45,7 @@ class Inputs:
     Attributes
     ----------
     types : message type of each topic, by full name
+    heard : topics that a message has come on, by full name
     """
 
     def __init__(
@@ -54,7 +58,9 @@ class Inputs:
         self._readers = readers
         self._intake = Intake(node)
         self._demand: tuple[TopicReader, Any] | None = None
-        self.types = {node.resolve_topic_name(topic): reader.read.types.name for topic, reader in readers.items()}
+        self._full = {topic: node.resolve_topic_name(topic) for topic in readers}
+        self.types = {self._full[topic]: reader.read.types.name for topic, reader in readers.items()}
+        self.heard: set[str] = set()
         for topic, reader in readers.items():
             kind = messages.message_class(reader.read.types.name)
             asked = _asked(reader, lockstep=on_demand is not None)
@@ -86,12 +92,14 @@ class Inputs:
         ahead_ns = now_ns - time.time_ns()  # of DDS, which tells when an unstamped message was sent
         for topic, reader in self._readers.items():
             for data, info in self._intake.take(topic):
+                self.heard.add(self._full[topic])
                 for reading in reader(data, info["source_timestamp"] + ahead_ns):
                     judge(monitor, reading, now_ns)
 
     def push_demand(self, queue: LockstepQueue, data: bytes, info: dict[str, Any]) -> None:
         """Lock-step: a demand into the queue of sets."""
         assert self._demand is not None
+        self.heard.add(self._demand[1].topic_name)
         sent_ns = info["source_timestamp"]
         for reading in self._demand[0](data, sent_ns):
             if isinstance(reading, DemandReading):
@@ -101,12 +109,24 @@ class Inputs:
         """Lock-step: what belongs to a set into the queue of sets, the rest to the monitor."""
         for topic, reader in self._readers.items():
             for data, info in self._intake.take(topic):
+                self.heard.add(self._full[topic])
                 for reading in reader(data, info["source_timestamp"]):
                     kind = _QUEUES.get(type(reading))
                     if kind is not None:
                         queue.push(kind, reading.stamp_ns, info["source_timestamp"], reading)
                     else:
                         judge(monitor, reading, now_ns)
+
+    def how_to_hear(self, topic: str, msgtype: str) -> str:
+        """What to write in the signals file to take a topic (full name) with another type; "" if that is not clear."""
+        try:
+            types = types_of(msgtype)
+        except BagError:
+            return ""
+        (reader,) = (self._readers[name] for name, full in self._full.items() if full == topic)
+        fields = {source.key: field_like(source, types) for source in reader.sources}
+        found = [f"{key}: {{type: {msgtype}, field: {field}}}" for key, field in fields.items() if field]
+        return f"; to hear it, write {', '.join(found)}" if found else ""
 
     def close(self) -> None:
         """Drop the subscriptions."""

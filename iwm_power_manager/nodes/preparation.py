@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from iwm_power_manager.control.controller import Controller, ControllerLimits
+from iwm_power_manager.control.monitor import DEMAND
 from iwm_power_manager.control.thresholds import actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.errors import BagError, ConfigError, IwmError
 from iwm_power_manager.nodes import power_manager_config as config
@@ -80,7 +81,7 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
     mapping = load_mapping(resolve(values["signals_file"]))
     if values["signals_file"] == DEFAULT_MAPPING:
         mapping = mapping.with_wheel_names(names)
-    readers, commands = _interface(mapping, controller, vehicle, names)
+    readers, commands = _interface(mapping, controller, vehicle, values)
     # The first call compiles the law or reads it from the cache: seconds that no control step may take.
     for warmed in policies.tables():
         controller.policy = warmed
@@ -93,11 +94,11 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
 
 
 def _interface(
-    mapping: SignalMapping, controller: Controller, vehicle: Vehicle, names: tuple[str, ...]
+    mapping: SignalMapping, controller: Controller, vehicle: Vehicle, values: Mapping[str, Any]
 ) -> tuple[dict[str, TopicReader], dict[str, CommandWriter]]:
     mapping.check_live()
     monitor = controller.monitor
-    assembly = Assembly(names, vehicle.params, lambda: monitor.speed_mps)
+    assembly = Assembly(tuple(values["wheel_names"]), vehicle.params, lambda: monitor.speed_mps)
     types = {}
     for source in (source for sources in mapping.sources.values() for source in sources):
         _check_installed(mapping.path, source.key, source.type)
@@ -107,6 +108,8 @@ def _interface(
     commands = {kind: CommandWriter(mapping.path, sinks) for kind, sinks in mapping.commands.items()}
     readers = topic_readers(mapping, types, assembly)
     assembly.warm(mapping.sources)
+    limits = f"demand_min_w {values['demand_min_w']:g} to demand_max_w {values['demand_max_w']:g}"
+    monitor.tallies[DEMAND].describe = lambda: f"{assembly.wanted_in_words()}; allowed: {limits}"
     return readers, commands
 
 

@@ -38,7 +38,7 @@ from iwm_power_manager.bags.writer import Sample, WriterOptions
 from iwm_power_manager.errors import BagError, IwmError, one_line
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.ros import ending
-from iwm_power_manager.ros.arguments import EXIT_CODES, parameters_help
+from iwm_power_manager.ros.arguments import EXIT_CODES, check_parameter_files, parameters_help
 from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.messages import (
     CLOCK,
@@ -438,6 +438,7 @@ def _run_node(arguments: list[str]) -> int:
     code = 1
     try:
         node = Recorder()
+        check_parameter_files(arguments, node.get_fully_qualified_name())
         _record(node, interruption)
         code = 0
     except IwmError as error:  # not left to the caller: as long as it is on its way, it keeps the node

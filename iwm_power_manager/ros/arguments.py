@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
+from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import read_yaml
 from iwm_power_manager.ros.specs import ParameterError, Spec
 
@@ -16,21 +19,40 @@ EXIT_CODES = "exit codes: 0 ended as asked, 1 could not start or failed, 2 bad a
 _PARAMS_FILE = "--params-file"
 
 
-def check_parameter_files(arguments: Sequence[str]) -> None:
-    """Refuse a parameter file that cannot be read, before ROS does so in terms of its source code.
+def check_parameter_files(arguments: Sequence[str], node: str = "") -> None:
+    """Refuse a parameter file that ROS would refuse in terms of its source code, or pass over without a word.
 
     Parameters
     ----------
     arguments : command line, with or without the program's name
+    node : full name of the node, once that is known
 
     Raises
     ------
     ConfigError
-        A file after `--params-file` is missing, unreadable or no YAML mapping.
+        A file after `--params-file` is missing, unreadable or no YAML mapping, or all of it is for other nodes.
     """
     for option, path in itertools.pairwise(arguments):
         if option == _PARAMS_FILE:
-            read_yaml(path)
+            names = list(_node_names(read_yaml(path)))
+            if node and names and not any(_fits(name, node) for name in names):
+                raise ConfigError(path, names[0], f"is not this node, which is {node}", f"/**, or {node}")
+
+
+def _node_names(content: Mapping[str, Any], above: str = "") -> Iterator[str]:
+    """Names, with wildcards, of the nodes that a parameter file is for."""
+    for key, inner in content.items():
+        if key == "ros__parameters":
+            yield above
+        elif isinstance(inner, Mapping):
+            yield from _node_names(inner, f"{above}/{str(key).strip('/')}")
+
+
+def _fits(pattern: str, node: str) -> bool:
+    """As rcl has it: `*` is one part of a name, `**` any number of them, none included."""
+    parts = {"**": r"(/\w+)*", "*": r"/\w+"}
+    expression = "".join(parts.get(part, "/" + re.escape(part)) for part in pattern.split("/")[1:])
+    return re.fullmatch(expression, node) is not None
 
 
 def parameters_help(specs: Iterable[Spec]) -> str:

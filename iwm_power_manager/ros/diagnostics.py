@@ -166,12 +166,9 @@ class InputReport:
             for reason, count in sorted(tally.dropped.items()):
                 values[f"{topic}: dropped, {_words(reason)}"] = str(count)
             if topic in missing:
-                why = f" ({_words(tally.violation)})" if tally.violation is not Violation.NONE else ""
-                problems.append((ERROR, f"{topic} is missing{why}"))
+                problems.append((ERROR, f"{topic} is missing" + (f" ({tally.why()})" if tally.why() else "")))
             elif dropped > self._dropped.get(topic, 0):
-                problems.append(
-                    (WARN, f"{topic}: {_words(tally.violation)}" if tally.violation else f"{topic}: dropped")
-                )
+                problems.append((WARN, f"{topic}: {tally.why() or 'dropped'}"))
             self._received[topic], self._dropped[topic] = tally.received, dropped
         for name, verdict in zip(wheel_names, verdicts, strict=True):
             values[f"wheel {name}"] = _words(verdict)

@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, qos_check_compatible
 
 
-def mismatched_publishers(node: Node, subscriptions: Iterable[Any], msgtypes: dict[str, str]) -> dict[str, str]:
+def mismatched_publishers(
+    node: Node, subscriptions: Iterable[Any], msgtypes: dict[str, str], remedy: Callable[[str, str], str]
+) -> dict[str, str]:
     """Why publishers of these subscriptions' topics are not heard, by topic name of the subscription.
 
     Parameters
@@ -18,6 +20,7 @@ def mismatched_publishers(node: Node, subscriptions: Iterable[Any], msgtypes: di
     node : whose subscriptions they are
     subscriptions : of rclpy
     msgtypes : type of each, by topic name
+    remedy : says, for a topic and the type it is sent with, what to do about another type
     """
     found = {}
     for subscription in subscriptions:
@@ -27,7 +30,8 @@ def mismatched_publishers(node: Node, subscriptions: Iterable[Any], msgtypes: di
         lines = []
         for info in node.get_publishers_info_by_topic(topic):
             if info.topic_type != msgtypes[topic]:
-                lines.append(f"{_name(info)} sends {info.topic_type}, not {msgtypes[topic]}")
+                sent = info.topic_type
+                lines.append(f"{_name(info)} sends {sent}, not {msgtypes[topic]}{remedy(topic, sent)}")
                 continue
             fits, reason = qos_check_compatible(info.qos_profile, subscription.qos_profile)
             if fits == QoSCompatibility.ERROR:

@@ -96,6 +96,23 @@ def field_kind(types: Types, path: str) -> str:
     return "number" if argument[0] in _NUMBERS else "text"
 
 
+def numbers_in(types: Types, array: bool) -> list[str]:
+    """Paths of all numbers of a type outside of lists, or of all arrays of numbers."""
+    from rosbags.interfaces import Nodetype
+
+    found: list[str] = []
+    waiting = [("", types.name)]
+    while waiting:
+        above, name = waiting.pop()
+        for field, (kind, argument) in types.store.fielddefs[name][1]:
+            path = f"{above}{field}"
+            if kind == Nodetype.NAME:
+                waiting.append((path + ".", str(argument)))
+            elif field_kind(types, path) == ("array" if array else "number"):
+                found.append(path)
+    return found
+
+
 def has_header(types: Types) -> bool:
     """Whether a type begins with a `std_msgs/Header`, and so with a stamp."""
     fields = types.store.fielddefs[types.name][1]

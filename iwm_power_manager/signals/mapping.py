@@ -120,6 +120,11 @@ class Source(NamedTuple):
         """One of four sources of a signal of wheels."""
         return self.key.endswith("]")
 
+    @property
+    def of_all_wheels(self) -> bool:
+        """The one source of a signal of wheels: its field is an array."""
+        return self.key.rpartition(".")[2] in OF_WHEELS
+
 
 class SignalMapping(NamedTuple):
     """A checked mapping file.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,15 @@ from iwm_power_manager.control.monitor import BatteryReading, JointReading, Spee
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.pedals import ACCELERATION, FORCE, PEDAL_TRAVEL, TORQUE, demand_power_w
-from iwm_power_manager.signals.cdr import MessageReader, MessageWriter, UnreadableError, blank, field_kind, names_path
+from iwm_power_manager.signals.cdr import (
+    MessageReader,
+    MessageWriter,
+    UnreadableError,
+    blank,
+    field_kind,
+    names_path,
+    numbers_in,
+)
 from iwm_power_manager.signals.mapping import (
     BATTERY,
     DEMANDS,
@@ -26,6 +35,7 @@ from iwm_power_manager.signals.mapping import (
     OF_WHEELS,
     PEDALS,
     SIGNALS,
+    UNITS,
     WHEELS,
     SignalMapping,
     Source,
@@ -121,6 +131,7 @@ class Assembly:
     Attributes
     ----------
     battery : last value of each of `mapping.BATTERY`, NaN before the first
+    wanted : signal and value, in its SI unit, of the last demand
     """
 
     def __init__(
@@ -133,6 +144,7 @@ class Assembly:
         self.vehicle = vehicle
         self.battery = dict.fromkeys(BATTERY, _NAN)
         self.speed_read_mps = 0.0
+        self.wanted = "power_demand", _NAN
         self._speed_mps = speed_mps or (lambda: self.speed_read_mps)
         self._pedals = dict.fromkeys(PEDALS, 0.0)
         self._wheels = {signal: [_NAN] * WHEELS for signal in _JOINTS}
@@ -140,6 +152,7 @@ class Assembly:
 
     def demand_w(self, signal: str, value: float) -> float:
         """A demand in its own unit as power at the present speed, W."""
+        self.wanted = signal, value
         if signal == "power_demand":
             return value
         assert self.vehicle is not None  # checked when the readers were made
@@ -153,6 +166,12 @@ class Assembly:
             return _NAN
         # A brake demand gets through whatever the accelerator says.
         return float(demand_power_w(PEDAL_TRAVEL, 0.0 if brake > 0.0 else accelerator, brake, speed, self.vehicle))
+
+    def wanted_in_words(self) -> str:
+        """The last demand as it was said, and the power it became."""
+        signal, value = self.wanted
+        power = "" if signal == "power_demand" else f", which is {self.demand_w(signal, value):g} W"
+        return f"{signal} {value:g} {next(iter(UNITS[signal]))}{power}"
 
     def warm(self, signals: Iterable[str]) -> None:
         """Compile what the conversion of these signals needs, or read it from the cache."""
@@ -232,7 +251,7 @@ def _topic_reader(file: Path, types: Types, found: list[tuple[str, int, Source]]
     stamped = True
     binds: list[_Bind] = []
     for signal, wheel, source in found:
-        _check_source(file, types, source, all_wheels=signal in OF_WHEELS and wheel < 0)
+        _check_source(file, types, source)
         _check_vehicle(file, signal, source, assembly.vehicle)
         place = fields.setdefault(source.field, len(fields))
         names = names or (names_path(source.field) if source.names else "")
@@ -260,17 +279,25 @@ def _together(binds: list[_Bind]) -> _Bind:
     return all_of_them
 
 
-def _check_source(file: Path, types: Types, source: Source, *, all_wheels: bool) -> None:
+def _check_source(file: Path, types: Types, source: Source) -> None:
     msgtype = types.name
     if source.type and source.type != msgtype:
         raise ConfigError(file, f"{source.key}.type", f"{source.topic} carries {msgtype}, not {source.type}")
     kind = field_kind(types, source.field)
-    wanted = "array" if all_wheels else "number"
+    wanted = "array" if source.of_all_wheels else "number"
     if kind != wanted:
         problem = f"{source.field} is {_ARTICLES[kind]}" if kind else f"{msgtype} has no field {source.field}"
-        raise ConfigError(file, f"{source.key}.field", problem, f"a field of {msgtype} that is {_ARTICLES[wanted]}")
+        allowed = f"a field of {msgtype} that is {_ARTICLES[wanted]}"
+        near = field_like(source, types)
+        raise ConfigError(file, f"{source.key}.field", problem, allowed + (f", such as {near}" if near else ""))
     if source.names and field_kind(types, names_path(source.field)) != "texts":
         raise ConfigError(file, f"{source.key}.names", f"{msgtype} has no field `name` beside {source.field}")
+
+
+def field_like(source: Source, types: Types) -> str:
+    """The field of a type that is most like that of a source; "" if none could be its."""
+    found = numbers_in(types, array=source.of_all_wheels)
+    return next(iter(get_close_matches(source.field, found, 1, 0.0 if len(found) == 1 else 0.5)), "")
 
 
 def _check_vehicle(file: Path, signal: str, source: Source, vehicle: VehicleParams | None) -> None:
@@ -297,8 +324,6 @@ def _bind(signal: str, wheel: int, source: Source, place: int, assembly: Assembl
         return _bind_speed(place, scale, assembly)
     if signal in OF_WHEELS and wheel < 0:
         return _bind_wheels(_JOINTS[signal], source, place, scale, assembly)
-    if signal == "power_demand" and scale is None:
-        return lambda time_ns, values, _: (DemandReading(time_ns, values[place]),)
     scaled = scale or (lambda value: value)
     if signal in OF_WHEELS:
         return lambda time_ns, values, _: assembly.wheel(signal, wheel, time_ns, scaled(values[place]))

@@ -175,10 +175,54 @@ def test_ros2_control_is_commanded_in_the_order_of_its_joints(
     car.stack.drive(inputs, lambda: commanded() == expected, "400 N", 1.0 / rate_hz)
 
 
+WRONG_IN_THREE_WAYS = """
+signals:
+  speed: {topic: odom, type: geometry_msgs/msg/TwistStamped, field: twist.linear.x, unit: m/s}
+  wheel_speed:
+    - {topic: rpm_0, type: std_msgs/msg/Float64, field: data, unit: rpm}
+    - {topic: rpm_1, type: std_msgs/msg/Float64, field: data, unit: rpm}
+    - {topic: rpm_2, type: std_msgs/msg/Float64, field: data, unit: rpm}
+    - {topic: rpm_3, type: std_msgs/msg/Float64, field: data, unit: rpm}
+  force_demand: {topic: force, type: std_msgs/msg/Float64, field: data, unit: kN}
+  soc: {topic: charge, type: std_msgs/msg/Float64, field: data, unit: "1"}
+"""
+
+
+def test_what_it_waits_for_names_the_topic_the_reason_and_the_remedy(connect: Callable[..., Connected]) -> None:
+    """A speed of another type, two of four wheels, and a force in N where the file says kN."""
+    sends = {"odom": ODOMETRY, "rpm_2": NUMBER} | dict.fromkeys(("rpm_0", "rpm_1", "force", "charge"), NUMBER)
+    car = connect(WRONG_IN_THREE_WAYS, sends)
+
+    def inputs(stack: Stack) -> dict[str, Any]:
+        odometry = of_type(ODOMETRY, header__stamp=stack.stamp())
+        return {
+            "odom": odometry,
+            "rpm_0": number(0.0),
+            "rpm_1": number(0.0),
+            "force": number(4e3),
+            "charge": number(0.5),
+        }
+
+    def waits() -> str:
+        lines = [line for line in car.running.text().splitlines() if "waits for" in line]
+        return lines[-1] if "force_demand" in (lines or [""])[-1] else ""
+
+    line = car.stack.drive(inputs, waits, "what it waits for")
+    remedy = "sends nav_msgs/msg/Odometry, not geometry_msgs/msg/TwistStamped; to hear it, write signals.speed: "
+    assert remedy + "{type: nav_msgs/msg/Odometry, field: twist.twist.linear.x}" in line
+    name = car.stack.node.get_namespace()
+    assert f"wheel_states on {name}/rpm_2, {name}/rpm_3 (no message; no publisher)" in line
+    assert "out of range: force_demand 4e+06 N, which is 4e+06 W; allowed: demand_min_w -600000 to" in line
+    assert "battery" not in line
+
+
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        ({"linear.x": "linear.q"}, "signals.speed.field: geometry_msgs/msg/Twist has no field linear.q"),
+        (
+            {"linear.x": "linear.q"},
+            "has no field linear.q; allowed: a field of geometry_msgs/msg/Twist that is a number, such as linear.",
+        ),
         ({"unit: km/h": "unit: knots"}, "signals.speed.unit: 'knots' is unknown; allowed: m/s"),
         (
             {"geometry_msgs/msg/Twist,": "my_msgs/msg/Speed,"},

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 
 import pytest
+import rclpy
 import yaml
 from rclpy.parameter import Parameter
 
@@ -166,6 +167,49 @@ class TestPowerManager:
         limits = input_limits(thresholds, 0.33, by_clock=False)
         assert limits.stamp is None
         assert math.isinf(limits.demand_delay_s)
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "/**",
+        "/*",
+        "/*/*",
+        "pm",
+        "/car_1/pm",
+        "car_1/pm",
+        "/*/pm",
+        "/**/pm",
+        "/**/p",
+        "/car_1/**",
+        "/car_1",
+        "/pm",
+        "other",
+    ],
+)
+def test_a_parameter_file_is_refused_exactly_where_ros_passes_over_it(tmp_path, key: str) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_text(f"{key}:\n  ros__parameters:\n    seen: 1\n")
+    arguments = ["--ros-args", "--params-file", str(path)]
+    context = rclpy.Context()
+    rclpy.init(context=context, args=[])
+    node = rclpy.create_node(
+        "pm",
+        context=context,
+        namespace="/car_1",
+        cli_args=arguments,
+        automatically_declare_parameters_from_overrides=True,
+        start_parameter_services=False,
+        enable_rosout=False,
+    )
+    seen = node.has_parameter("seen")
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+    if seen:
+        check_parameter_files(arguments, "/car_1/pm")
+    else:
+        with pytest.raises(ConfigError, match="is not this node, which is /car_1/pm"):
+            check_parameter_files(arguments, "/car_1/pm")
 
 
 def test_parameter_files_on_the_command_line_are_read_before_ros_does(tmp_path) -> None:

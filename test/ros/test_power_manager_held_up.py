@@ -15,13 +15,10 @@ from typing import NamedTuple
 import pytest
 from rolling_car import Heard, RollingCar
 
-from campaigns import soak
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.control.thresholds import Thresholds
 
 T = Thresholds()
-#: Shared memory of Fast DDS does not survive that a process is stopped for a second: see docs/safety.md.
-UDP = soak.without_shared_memory({})
 DRIVE_W, BRAKE_W = 5000.0, -6000.0
 NS_PER_S = 1e9
 
@@ -94,7 +91,7 @@ def check(found: Hold, brakes: bool) -> None:
 
 
 def run(start_pair, count: int, seed: int) -> list[Hold]:
-    pair = start_pair(environment=UDP)
+    pair = start_pair()
     pair.bench.connect()
     car = RollingCar(pair.bench, 10.0)
     source = random.Random(seed)
@@ -107,6 +104,7 @@ def run(start_pair, count: int, seed: int) -> list[Hold]:
         del car.motors[:-1], car.brakes[:-1], pair.bench.states[:-1], pair.bench.torques[:-1]
     assert pair.running.process.poll() is None
     assert "this process was held up" in pair.running.text()
+    assert all("(" in line for line in pair.running.text().splitlines() if "waits for" in line)
     return found
 
 

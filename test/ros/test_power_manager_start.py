@@ -69,6 +69,14 @@ def test_a_parameter_file_that_is_missing_or_no_yaml_gives_one_line(tmp_path) ->
     assert f"power_manager: {broken}: line 1" in fails_with(tmp_path, ["--ros-args", "--params-file", str(broken)])
 
 
+def test_a_parameter_file_for_another_node_is_refused(tmp_path) -> None:
+    """ROS passes over it without a word, and the node would drive with its defaults."""
+    path = tmp_path / "params.yaml"
+    path.write_text("power_manager:\n  ros__parameters:\n    friction: 0.3\n")
+    line = fails_with(tmp_path, ["--ros-args", "-r", "__ns:=/car_1", "--params-file", str(path)])
+    assert line.startswith(f"power_manager: {path}: /power_manager: is not this node, which is /car_1/power_manager; ")
+
+
 def test_it_runs_from_its_parameter_file_in_a_namespace_with_remaps(tmp_path, compiled_law) -> None:
     params = str(resolve("config/nodes/power_manager.yaml"))
     args = arguments({"strategy": "equal"}, {"__ns": "/car", "vehicle_speed": "/gps/speed"})
