@@ -17,11 +17,13 @@ from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.nodes.preparation import Prepared
 from iwm_power_manager.ros import messages, qos
 from iwm_power_manager.signals.commands import FRICTION, MOTOR
-from iwm_power_manager.signals.contract import JOINT_STATE, NODE_STATE
+from iwm_power_manager.signals.contract import JOINT_STATE, NODE_FRICTION, NODE_STATE
 from iwm_power_manager.signals.readings import joint_state_writer
 
 _ZERO = (0.0, 0.0, 0.0, 0.0)
 _ACKNOWLEDGE_S = 0.2
+_ESTIMATE = ("left_friction", "right_friction", "left_friction_confidence", "right_friction_confidence")
+_ESTIMATE_S = 0.1
 
 
 class Outputs:
@@ -43,12 +45,15 @@ class Outputs:
         self._node = node
         self._writers = prepared.commands
         self._write_state = joint_state_writer(SIGNAL_NAMES, "position")
+        self._write_estimate = joint_state_writer(_ESTIMATE, "position")
+        self._estimate_every = max(round(_ESTIMATE_S / (period_s or _ESTIMATE_S)), 1)
+        self._steps = 0
         types = {sink.topic: sink.type for sinks in prepared.mapping.commands.values() for sink in sinks}
         self.topics = list(types)
-        types[NODE_STATE] = JOINT_STATE
+        types[NODE_STATE] = types[NODE_FRICTION] = JOINT_STATE
         self.types = {node.resolve_topic_name(topic): kind for topic, kind in types.items()}
         offered = dict.fromkeys(self.topics, qos.command_profile(period_s))
-        offered[NODE_STATE] = qos.profile(lockstep=period_s is None)
+        offered[NODE_STATE] = offered[NODE_FRICTION] = qos.profile(lockstep=period_s is None)
         # What cannot be met is told in the diagnostics; an event handler would be waited for at each step.
         silent = PublisherEventCallbacks(use_default_callbacks=False)
         overrides = QoSOverridingOptions.with_default_policies()
@@ -70,11 +75,17 @@ class Outputs:
 
     def answer(self, stamp_ns: int, step: Step) -> list[tuple[str, bytes]]:
         """Messages that say what came of a step, by topic."""
-        return [
-            *self._writers[MOTOR](stamp_ns, step.command.motor_torque_nm),
-            *self._writers[FRICTION](stamp_ns, step.command.friction_torque_nm),
+        made = step.command
+        answer = [
+            *self._writers[MOTOR](stamp_ns, made.motor_torque_nm),
+            *self._writers[FRICTION](stamp_ns, made.friction_torque_nm),
             (NODE_STATE, self._write_state(stamp_ns, step.values)),
         ]
+        if self._steps % self._estimate_every == 0:
+            grip = (made.left_friction, made.right_friction, made.left_confidence, made.right_confidence)
+            answer.append((NODE_FRICTION, self._write_estimate(stamp_ns, grip)))
+        self._steps += 1
+        return answer
 
     def publish(self, answer: list[tuple[str, bytes]], may_send: Callable[[float], bool] = lambda _: True) -> bool:
         """Publish messages, each only if `may_send` allows it at that moment (monotonic s); False if it did not."""

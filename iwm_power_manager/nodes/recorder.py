@@ -43,6 +43,7 @@ from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.messages import (
     CLOCK,
     FRICTION_BRAKE_COMMAND,
+    NODE_FRICTION,
     NODE_STATE,
     POWER_DEMAND,
     POWER_MANAGER_STATE,
@@ -60,7 +61,7 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.types import definition_of
 
 DIAGNOSTICS = "/diagnostics"
-DEFAULT_TOPICS = [topic for topic in TOPIC_TYPES if topic not in (NODE_STATE, RECORDER_READY)]
+DEFAULT_TOPICS = [topic for topic in TOPIC_TYPES if topic not in (NODE_FRICTION, NODE_STATE, RECORDER_READY)]
 #: What a closed loop cannot run without: `~/ready` waits for these.
 DEFAULT_WAIT_FOR = [
     VEHICLE_SPEED,

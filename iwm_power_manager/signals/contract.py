@@ -29,6 +29,7 @@ FRICTION_BRAKE_COMMAND = "friction_brake_command"
 POWER_MANAGER_STATE = "power_manager/state"
 #: The same as the node itself names it: private, so that a renamed node has one of its own.
 NODE_STATE = "~/state"
+NODE_FRICTION = "~/road_friction"
 DIAGNOSTICS = "/diagnostics"
 RECORDER_READY = "recorder/ready"
 CLOCK = "/clock"
@@ -151,6 +152,17 @@ TOPICS = (
         "power_manager",
         "named numbers: `name` is the signal, `position` its value",
         _STEP,
+        "reliable",
+        "",
+    ),
+    Topic(
+        NODE_FRICTION,
+        JOINT_STATE,
+        "out",
+        "power_manager",
+        "the road under the wheels of either side as estimated, signals `left_friction` to `right_friction_confidence` "
+        "of the state, in the same form",
+        "10 Hz",
         "reliable",
         "",
     ),

@@ -310,6 +310,19 @@ def test_friction_may_come_from_its_topic_and_falls_back_when_that_is_stale(benc
     assert bench.set_parameter("friction_source", "parameter") == ""
 
 
+def test_the_friction_it_has_estimated_is_published_ten_times_a_second(bench) -> None:
+    heard: dict[int, dict[str, float]] = {}
+    kind, topic = messages.TOPIC_TYPES[messages.NODE_FRICTION], messages.NODE_FRICTION.replace("~", "power_manager")
+    bench.node.create_subscription(kind, topic, lambda it: heard.update([messages.read_named_numbers(it)]), 10)
+    bench.states.clear()
+    bench.state_stamps.clear()
+    bench.drive(lambda: len(heard) >= 5 and max(heard) <= bench.state_stamps[-1], "estimates of the friction")
+    names = ["left_friction", "right_friction", "left_friction_confidence", "right_friction_confidence"]
+    said = dict(zip(bench.state_stamps, bench.states, strict=True))
+    assert heard == {stamp: {name: said[stamp][name] for name in names} for stamp in heard}
+    assert len(bench.states) > 9 * (len(heard) - 1)
+
+
 def test_what_came_before_activation_is_forgotten(bench) -> None:
     assert bench.set_parameter("friction", 0.9) == ""
     assert bench.set_parameter("friction_source", "topic") == ""
