@@ -8,7 +8,6 @@ after the time docs/safety.md promises, how long recovery took after the fault w
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import math
@@ -29,6 +28,7 @@ import rclpy
 from campaigns import fault_relay as relay
 from campaigns.fault_relay import FaultRelay
 from iwm_power_manager import files
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.supervision import MODE_NORMAL
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.nodes import power_manager_config as config
@@ -434,7 +434,7 @@ HEADER = (
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the campaign; exit code 1 if a fault did what it must not do."""
-    parser = argparse.ArgumentParser(prog="faults", description=__doc__)
+    parser = CommandParser("faults", description=__doc__)
     parser.add_argument("--strategy", default="sdp", choices=config.BY_NAME["strategy"].choices)
     parser.add_argument(
         "--missed-periods",

@@ -28,6 +28,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from iwm_power_manager import files
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.ros import ending, qos
@@ -175,7 +176,7 @@ def row(name: str, values_s: NDArray[Any]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; exit code 1 if the control path costs more than it may."""
-    parser = argparse.ArgumentParser(prog="latency", description=__doc__)
+    parser = CommandParser("latency", description=__doc__)
     parser.add_argument("--count", type=int, default=5000, help="sets of inputs to each of the two (5000)")
     parser.add_argument("--seconds", type=float, default=30.0, help="time the jitter is watched for (30)")
     parser.add_argument("--strategy", default="equal", help="strategy of the power manager (equal)")

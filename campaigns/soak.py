@@ -8,7 +8,6 @@ was the machine's. At the end the bag has to hold exactly what each topic's publ
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import os
@@ -28,6 +27,7 @@ from sensor_msgs.msg import JointState
 from campaigns.witness import Witness
 from iwm_power_manager import files
 from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.ros import messages as m
 from iwm_sim.dds_drive import environment, node_command
@@ -280,7 +280,7 @@ def drive(minutes: float, priority: int, processor: int | None, folder: Path) ->
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the soak; exit code 1 if anything grew, was lost, or was late by itself."""
-    parser = argparse.ArgumentParser(prog="soak", description=__doc__)
+    parser = CommandParser("soak", description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0, help="how long (30)")
     parser.add_argument(
         "--priority",

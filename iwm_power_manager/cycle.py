@@ -13,6 +13,7 @@ import csv
 import hashlib
 import math
 from dataclasses import dataclass
+from dataclasses import field as attribute
 from pathlib import Path
 
 import numpy as np
@@ -49,9 +50,9 @@ class Cycle:
     """
 
     name: str
-    time_s: NDArray[np.float64]
-    speed_mps: NDArray[np.float64]
-    grade: NDArray[np.float64]
+    time_s: NDArray[np.float64] = attribute(repr=False)
+    speed_mps: NDArray[np.float64] = attribute(repr=False)
+    grade: NDArray[np.float64] = attribute(repr=False)
     sha256: str
     path: str = ""
 

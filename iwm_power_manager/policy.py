@@ -103,6 +103,12 @@ class Policy:
     checksum: str
     residual_j: float | None = None
 
+    def __repr__(self) -> str:
+        return (
+            f"Policy({self.vehicle_name}, idle drive {self.idle_drive}, friction {self.friction:g}, "
+            f"grid {self.problem.name}, {' x '.join(map(str, self.problem.shape))} states, {self.checksum[:12]})"
+        )
+
     @property
     def proven_j(self) -> float | None:
         """What the residual proves: distance of `cost_j` from the optimal cost-to-go at most, J."""

@@ -56,7 +56,7 @@ class Vehicle:
     name: str
     path: Path
     idle_drive: str
-    params: VehicleParams
+    params: VehicleParams = dataclasses.field(repr=False)
     hash: str
     notes: tuple[str, ...] = ()
 

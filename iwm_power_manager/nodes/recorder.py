@@ -35,6 +35,7 @@ from iwm_power_manager.bags.metadata import Topic
 from iwm_power_manager.bags.recording import FAILED, Recording, RecordingOptions
 from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.bags.writer import Sample, WriterOptions
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import BagError, IwmError, one_line
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.ros import ending
@@ -397,13 +398,12 @@ examples:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="recorder",
+    parser = CommandParser(
+        "recorder",
         usage="recorder [--ros-args -p NAME:=VALUE ... | --params-file FILE | -r FROM:=TO]\n"
         "       recorder --recover BAG ...",
         description="Record topics to a rosbag2 MCAP bag until Ctrl-C, or make a valid bag of what a crash left.",
         epilog=f"{parameters_help(PARAMETERS)}\n\n{_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "--recover",

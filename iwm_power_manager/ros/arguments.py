@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import read_yaml
 from iwm_power_manager.ros.specs import ParameterError, Spec
@@ -80,12 +80,11 @@ def check_arguments(
         What stands after `--ros-args` is wrong.
     """
     given = sys.argv if args is None else list(args)
-    parser = argparse.ArgumentParser(
-        prog=node,
+    parser = CommandParser(
+        node,
         usage=f"{node} [-h] [--ros-args --params-file FILE -p PARAMETER:=VALUE -r FROM:=TO ...]",
         description=description,
         epilog=f"{parameters_help(specs)}\n\nexamples:\n{examples}\n{EXIT_CODES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     if "--ros-args" not in given and set(given).intersection(("-h", "--help")):
         parser.parse_args(given[1:])

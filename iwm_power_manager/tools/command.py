@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import sys
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from iwm_power_manager import __version__
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.files import atomic_write
 
@@ -19,13 +21,7 @@ DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
 def described(name: str, description: str, examples: str, *, abbreviated: bool = True) -> argparse.ArgumentParser:
     """Parser of a command, with `--version` and examples as typed; whether options may be `abbreviated`."""
-    parser = argparse.ArgumentParser(
-        name,
-        description=description,
-        epilog=examples,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=abbreviated,
-    )
+    parser = CommandParser(name, description=description, epilog=examples, allow_abbrev=abbreviated)
     parser.add_argument("--version", action="version", version=f"{name} {__version__}")
     return parser
 
@@ -47,10 +43,20 @@ def write_json(path: Path | str, values: Any) -> None:
     atomic_write(path, (json.dumps(values, indent=1, allow_nan=False) + "\n").encode())
 
 
-def write_picture(path: Path | str, figure: Any) -> None:
-    """Write a matplotlib figure as PNG, atomically; the same figure gives the same bytes."""
-    import io
+#: Endings of a picture's name, and what would make its bytes differ from run to run or say who drew it.
+PICTURES = {".pdf": {"CreationDate": None}, ".png": {"Software": None}, ".svg": {"Date": None}}
 
+
+def picture(text: str) -> Path:
+    """Argument type of a picture's file name, refused before anything is computed for it."""
+    if Path(text).suffix.lower() not in PICTURES:
+        raise argparse.ArgumentTypeError(f"{text} is no picture's name; allowed: ending in {', '.join(PICTURES)}")
+    return Path(text)
+
+
+def write_picture(path: Path | str, figure: Any, dpi: int = 150) -> None:
+    """Write a matplotlib figure, atomically, as what the file's name ends in: PDF, PNG or SVG."""
+    kind = Path(path).suffix.lower()
     stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
+    figure.savefig(stream, format=kind[1:], dpi=dpi, facecolor="white", metadata=PICTURES[kind])
     atomic_write(path, stream.getvalue())

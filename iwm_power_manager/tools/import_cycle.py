@@ -97,7 +97,7 @@ def parser() -> argparse.ArgumentParser:
     drive.add_argument("--friction", type=given.number(0.01, 2), default=0.9, metavar="MU", help="default: %(default)s")
     output = result.add_argument_group("output")
     output.add_argument("--output", required=True, metavar="CSV", help="the cycle")
-    output.add_argument("--plot", metavar="PNG", help="picture of the log and the cycle made of it")
+    output.add_argument("--plot", type=command.picture, metavar="PICTURE", help="log and cycle as .pdf, .png or .svg")
     output.add_argument("--json", metavar="FILE", help="what was understood, with the numbers")
     output.add_argument("--quiet", action="store_true", help="print errors and warnings only")
     return result
@@ -135,7 +135,7 @@ def _import(options: argparse.Namespace) -> None:
         print(f"import_cycle: warning: {vehicle.name}: {warning}", file=sys.stderr)
     atomic_write(options.output, cycle_text(cycle, bool(options.grade)).encode())
     if options.plot:
-        _draw(Path(options.plot), log, raw, cycle, options.max_gap)
+        _draw(options.plot, log, raw, cycle, options.max_gap)
     if options.json:
         command.write_json(options.json, numbers)
 

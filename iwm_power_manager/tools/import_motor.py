@@ -85,7 +85,9 @@ def parser() -> argparse.ArgumentParser:
     reach.add_argument("--top-speed", type=given.number(0, 20e3), metavar="RAD_S")
     output = result.add_argument_group("output")
     output.add_argument("--output", required=True, metavar="CSV", help="the map")
-    output.add_argument("--plot", metavar="PNG", help="picture of the map, points and gaps included")
+    output.add_argument(
+        "--plot", type=command.picture, metavar="PICTURE", help="the map, with points and gaps, as .pdf, .png or .svg"
+    )
     output.add_argument("--json", metavar="FILE", help="what was understood, with the numbers")
     output.add_argument("--quiet", action="store_true", help="print errors and warnings only")
     return result
@@ -142,7 +144,7 @@ def _import(options: argparse.Namespace) -> None:
         print(f"import_motor: warning: it lacks {line}", file=sys.stderr)
     atomic_write(options.output, map_text(points).encode())
     if options.plot:
-        _draw(Path(options.plot), found, reach)
+        _draw(options.plot, found, reach)
     if options.json:
         command.write_json(options.json, numbers)
 

@@ -30,6 +30,7 @@ from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exc
 from iwm_power_manager.replay.what_if import Consumption, what_if
 from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.mapping import SignalMapping, load_mapping
+from iwm_power_manager.tools.command import described
 
 DONE, DIFFERENT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -74,15 +75,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="replay",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = described("replay", _DESCRIPTION, _EXAMPLES)
     strategies = ", ".join(drivable())
     parser.add_argument("bag", metavar="BAG", help="folder of the bag, or one .mcap or .db3 file")
-    parser.add_argument("--version", action="version", version=f"replay {__version__}")
     law = parser.add_argument_group("the law; what is not given comes from the bag, else from the package")
     law.add_argument("--vehicle", metavar="YAML", help="the car")
     law.add_argument("--policy", metavar="FILE", help="policy file, or folder of policies over friction")

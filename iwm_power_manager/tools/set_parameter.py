@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import argparse
 import difflib
 import sys
 import time
 from collections.abc import Sequence
 from typing import Any
 
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import IwmError
 
 _TRANSITIONS = ("configure", "activate", "deactivate", "cleanup", "shutdown")
@@ -109,11 +109,10 @@ exit codes: 0 done, 1 no such node or parameter, or refused, 2 bad arguments
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="set_parameter",
+    parser = CommandParser(
+        "set_parameter",
         description="List, read and set a running node's parameters, or ask for a lifecycle transition, without ros2.",
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("parameters", metavar="NAME[=VALUE]", nargs="*", help="read these, or set them; none: all")
     parser.add_argument("--node", default="/power_manager", help="full name of the node (default /power_manager)")

@@ -41,7 +41,7 @@ from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.demand import drive_source, read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
-from iwm_power_manager.tools.command import described, ended
+from iwm_power_manager.tools.command import described, ended, picture
 from iwm_power_manager.tools.options import several
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
@@ -121,7 +121,7 @@ def parser() -> argparse.ArgumentParser:
 
     output = result.add_argument_group("output")
     output.add_argument("--output", metavar="DIR|FILE", help="folder for the policies, or a .npz file for a single one")
-    output.add_argument("--plot", metavar="PNG", help="picture of transition matrix, convergence and policy")
+    output.add_argument("--plot", type=picture, metavar="PICTURE", help="demand, convergence, policy: .pdf, .png, .svg")
     output.add_argument("--json", metavar="FILE", help="the run's numbers")
     output.add_argument(
         "--export-mdp", metavar="NPZ", help="the exact problem, for another solver (one friction; docs/solver.md)"
@@ -172,7 +172,7 @@ def _solve(options: argparse.Namespace) -> int:
     if options.plot:
         from iwm_power_manager.tools.solver_figures import draw_solution
 
-        draw_solution([result.policy for result in solved], Path(options.plot))
+        draw_solution([result.policy for result in solved], options.plot)
         say(f"picture: {options.plot}")
     if options.json:
         atomic_write(options.json, json.dumps(_numbers(chain, sources, solved), indent=1).encode())

@@ -6,7 +6,6 @@ Charts and server are Bokeh's, whose scripts come from the same server: no netwo
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import itertools
 import sys
@@ -16,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.supervision import MODE_NAMES, STALE_NAMES
 from iwm_power_manager.control.types import GATE_NAMES, LIMIT_NAMES, WHEEL_NAMES
 from iwm_power_manager.errors import IwmError
@@ -249,11 +249,10 @@ exit codes: 0 ended with Ctrl-C, 1 could not serve, 2 bad arguments
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the page; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="watch_car",
+    parser = CommandParser(
+        "watch_car",
         description="Show a running car in the browser, from the power manager's topics alone; Ctrl-C ends it.",
         epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--port", type=int, default=8321, help="port on this machine (default 8321; 0: any)")
     parser.add_argument("--terminal", action="store_true", help="no page: print state and diagnostics once a second")

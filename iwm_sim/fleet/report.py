@@ -16,10 +16,9 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.tools.command import write_json
+from iwm_power_manager.tools.command import write_json, write_picture
 from iwm_sim.fleet.store import Store
 from iwm_sim.fleet.task import Drive, Road, Solve
-from iwm_sim.study.battery_fit import check_picture, save_picture
 from iwm_sim.study.names import REFERENCE
 from iwm_sim.study.palette import COLOURS
 from iwm_sim.study.report import (
@@ -265,8 +264,6 @@ def page_of(store: Store) -> tuple[Page, list[Savings]]:
 
 def make(folder: Path, page: Path, picture: Path | None = None, numbers: Path | None = None) -> None:
     """Write the page of a study, its first picture and its numbers, and print the savings."""
-    if picture:
-        check_picture(str(picture))
     store = Store(folder)
     made, savings = page_of(store)
     write_page(page, made)
@@ -274,7 +271,7 @@ def make(folder: Path, page: Path, picture: Path | None = None, numbers: Path | 
         print(plain_table(savings, _SAVINGS))
     print(f"page: {page}")
     if picture:
-        save_picture(distribution(store.table(Drive).to_pylist()), str(picture))
+        write_picture(picture, distribution(store.table(Drive).to_pylist()))
     if numbers:
         content = [
             {name: None if value != value else value for name, value in one._asdict().items()} for one in savings

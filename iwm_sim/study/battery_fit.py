@@ -16,20 +16,15 @@ and with the voltage free as well; voltage and resistance can stand in for each 
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.figure import Figure
 from scipy.optimize import minimize, minimize_scalar
 
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import Battery
 from iwm_power_manager.vehicle import nominal_voltage_v, with_params
 from iwm_sim import closed_loop
@@ -82,6 +77,7 @@ class Fit(NamedTuple):
     free : both fitted
     file : the circuit the vehicle's file has, for comparison
     comparison : of the first cycle, with `plant` (Fig. 7)
+    idle_drive : of the car
     """
 
     nominal: Estimate
@@ -89,6 +85,7 @@ class Fit(NamedTuple):
     free: Estimate
     file: Estimate
     comparison: Comparison
+    idle_drive: str
 
     def text(self) -> str:
         """The result in lines for a terminal."""
@@ -171,6 +168,7 @@ def fit(
         free=estimate(both.x[0], both.x[1] * nominal_v),
         file=estimate(battery.resistance_ohm, nominal_v),
         comparison=_comparison(vehicle, idle_drive, cycles[0], friction, soc, runs, plant, battery),
+        idle_drive=cases.vehicle_of(vehicle, idle_drive).idle_drive,
     )
 
 
@@ -217,19 +215,3 @@ def _comparison(
         soc=soc,
     )
     return Comparison(plant["time_s"], plant["speed_mps"], model["speed_mps"], plant["soc"], model["soc"])
-
-
-def check_picture(path: str) -> str:
-    """Kind of picture a file name stands for, "svg" or "png"; anything else is a `ConfigError`."""
-    kind = Path(path).suffix.lower().removeprefix(".")
-    if kind not in ("svg", "png"):
-        raise ConfigError("arguments", "--plot", f"{path} is no picture's name", "a name that ends in .svg or .png")
-    return kind
-
-
-def save_picture(figure: Figure, path: str) -> None:
-    """A figure as an SVG or PNG file."""
-    kind = check_picture(path)
-    stream = io.BytesIO()
-    figure.savefig(stream, format=kind, dpi=150, facecolor="white")
-    atomic_write(path, stream.getvalue())

@@ -8,7 +8,6 @@ this command says whether it did. Equal distribution, driven in one process, sta
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import signal
@@ -21,6 +20,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from iwm_power_manager import files, kernel_cache
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError, IwmError
@@ -62,10 +62,9 @@ exit codes: 0 driven, 1 failed or a file is unusable, 2 bad arguments, 130 inter
 
 def parse(arguments: Sequence[str] | None = None) -> Plan:
     """The plan of a command line; ends the program on a wrong one."""
-    parser = argparse.ArgumentParser(
-        prog="demo",
+    parser = CommandParser(
+        "demo",
         description="Drive a cycle over DDS with recorder, power manager and simulator, and show the result.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=_EXAMPLES,
     )
     shown = "(default: %(default)s)"
@@ -248,7 +247,11 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
     if plan.animate:
         from iwm_sim.study.moving_picture import animate
 
-        animate(run, plan.animate, f"{loaded.cycle.name}, friction {plan.friction:g}, {plan.strategy}")
+        animate(
+            run,
+            plan.animate,
+            f"{loaded.cycle.name}, friction {plan.friction:g}, idle drive {loaded.vehicle.idle_drive}, {plan.strategy}",
+        )
         print(f"moving picture: {plan.animate}")
     return 0 if outcome.complete else 1
 

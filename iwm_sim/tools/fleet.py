@@ -17,7 +17,7 @@ from iwm_power_manager import __version__
 from iwm_power_manager.control.strategies import drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
-from iwm_power_manager.tools.command import described, ended, write_json
+from iwm_power_manager.tools.command import described, ended, picture, write_json
 from iwm_power_manager.tools.options import number, several, whole
 from iwm_sim.study.names import cores
 
@@ -59,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
     report = commands.add_parser("report", help="one page of a study", allow_abbrev=False)
     report.add_argument("folder", type=Path, metavar="DIR", help="folder of a study")
     report.add_argument("--page", type=Path, metavar="HTML", help="the page (default: DIR/fleet.html)")
-    report.add_argument("--picture", type=Path, metavar="SVG|PNG", help="its first picture alone")
+    report.add_argument("--picture", type=picture, metavar="PICTURE", help="its first picture: .pdf, .png or .svg")
     report.add_argument("--json", type=Path, metavar="FILE", help="write what the page says as JSON")
     return result
 

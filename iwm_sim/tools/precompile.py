@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import IwmError
 
 #: What the work needs, but `--help` does not.
@@ -106,8 +107,8 @@ def _smallest_grid() -> dict[str, object]:
 
 def parser() -> argparse.ArgumentParser:
     """Options of `precompile`."""
-    made = argparse.ArgumentParser(
-        prog="precompile",
+    made = CommandParser(
+        "precompile",
         description="Compile the vehicle model, the control law and the solver once, so that every program starts "
         "warm. The code is kept in ~/.cache/iwm_power_manager or, if it is set, in IWM_CACHE_DIR, which then has to "
         "be the same where the programs run. Needed again after an update; what is compiled already is only looked up.",

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.files import atomic_write
@@ -25,8 +26,8 @@ DONE, FAILED = 0, 1
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
-    result = argparse.ArgumentParser(
-        prog="roads", description="Drive scenarios of real roads with the power manager and check what they require."
+    result = CommandParser(
+        "roads", description="Drive scenarios of real roads with the power manager and check what they require."
     )
     result.add_argument("scenario", nargs="*", help="files, or names of config/scenarios (default: all of them)")
     result.add_argument("--strategy", choices=list(drivable()), default=DEFAULT_STRATEGY, help="(default: %(default)s)")
