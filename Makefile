@@ -59,7 +59,7 @@ faults: setup-run  ## Fault campaign over DDS with the simulator in the loop
 soak: setup-dev  ## 30 minutes in real time at 100 Hz: memory, deadlines, counts
 	@$(BIN)/python -m campaigns.soak $(ARGS)
 
-nightly: setup-dev  ## The tests that are too long for every run, and far more random cases in the others
+nightly: setup-dev  ## The tests that are too long for every run, and far more random cases in the others (hours)
 	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest -m "nightly or not nightly" $(PYTEST_ARGS)
 
 # Compiled kernels leave no trace, so the safety code is covered as plain Python.

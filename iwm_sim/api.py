@@ -17,7 +17,7 @@ raises an `iwm_power_manager.errors.IwmError`, whose text is one line.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib as mpl
@@ -60,14 +60,14 @@ class Drive:
     ----------
     strategy : its name
     cycle, car : what was driven
-    run : series of every signal, `run["speed_mps"]`; the names are `iwm_sim.closed_loop.COLUMNS`
+    run : series of every signal, `run["speed_mps"]`; its names with their units are `iwm_sim.closed_loop.Row`
     metrics : energy, trace, slip, changes of the split
     """
 
     strategy: str
     cycle: Cycle
     car: Vehicle
-    run: closed_loop.Run
+    run: closed_loop.Run = field(repr=False)
     metrics: Metrics
 
     def saving_percent(self, reference: Drive) -> float | None:
@@ -79,7 +79,11 @@ class Drive:
         return {name: self.run[name] for name in COLUMNS}
 
     def frame(self) -> Any:
-        """The signals as a pandas.DataFrame with `time_s` as its index; `IwmError` without pandas."""
+        """The signals as a pandas.DataFrame: a row for each control step, `time_s` as its index.
+
+        Its columns are those of `iwm_sim.closed_loop.Row`, which says what each is and its unit. `IwmError` without
+        pandas.
+        """
         try:
             import pandas as pd
         except ImportError:
@@ -121,11 +125,16 @@ def drive(
     Parameters
     ----------
     cycle : file, short name, or a loaded cycle
-    car, friction : what is driven, and on what
+    car : what is driven
+    friction : peak friction coefficient of the road
     policy : of this car; with one, the strategy is the default one
-    strategy : name; "" is `sdp_lookahead` with a policy and `equal` without
+    strategy : key of `control.strategies.STRATEGIES`; "" is `sdp_lookahead` with a policy and `equal` without
     settings : of the law; its strategy is replaced
-    options : `dt_s`, `soc`, `until_s` and what else `closed_loop.run` takes
+    options : `dt_s` (control step, 0.01 s unless given), `soc` (at the start, 0..1), `until_s` and what else
+        `closed_loop.run` takes
+
+    The split is decided every `settings.decision_period_s`, 0.02 s by default. `evaluate`'s `paper_sdp` is no strategy
+    of its own but strategy `sdp` with a policy on grid `paper`, decided every 0.1 s (`docs/python.md` has the lines).
 
     Raises
     ------
@@ -179,6 +188,9 @@ def plot_share(policy: Policy, previous_share: float = 0.5, slip: float = 0.0) -
         axis.set_xlabel("Speed, m/s")
         axis.set_ylabel("Power demand, kW")
         before = f", previous share {previous_share:g}" if policy.problem.previous_share else ""
-        axis.set_title(f"Grid {policy.problem.name}, friction {policy.friction:g}{before}")
+        axis.set_title(
+            f"Grid {policy.problem.name}, friction {policy.friction:g}, idle drive {policy.idle_drive}{before}",
+            fontsize=10.0,
+        )
         figure.colorbar(image, ax=axis).set_label("Front share")
     return figure

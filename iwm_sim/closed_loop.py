@@ -49,7 +49,24 @@ class Row(NamedTuple):
     """One step of a run, taken at its start; torques, power and acceleration are what the plant did in that step.
 
     Wheel speeds, torques, slips and heat are those of the left wheel of each axle: on a straight, uniform road left and
-    right are alike. Drives where they are not have a `RoadRow` beside it.
+    right are alike. Drives where they are not have a `RoadRow` beside it. Units are in the names: `_nm` is N m, `_j` J;
+    without one a number has none.
+
+    Attributes
+    ----------
+    trace_mps, speed_mps : of the cycle, and of the car
+    power_demand_w : what the driver asks for at the wheels, braking negative
+    accelerator, brake : pedals, 0..1
+    decided_share, front_share : front power over power demand, 0..1: as decided, and as applied on the way there
+    gate : what is held at zero torque: 0 nothing, 1 front axle, 2 rear axle, 3 both
+    limits : what limits the command: a sum of `control.types.LIMIT_NAMES`' bits
+    front_power_w, rear_power_w : commanded to the axle at the wheels, motors and brakes together
+    front_motor_nm, rear_motor_nm, front_friction_nm, rear_friction_nm : torque of one motor, and of one brake (<= 0)
+    front_slip, rear_slip : eq. 10 of the paper, -1 is a locked wheel
+    soc : state of charge, 0..1
+    electrical_power_w, current_a : drawn from the battery, charging negative
+    front_heat, rear_heat : heat index of a motor, 0 cold to 1 hot
+    chemical_j : energy drawn from the cells since the start, losses included
     """
 
     time_s: float

@@ -67,11 +67,15 @@ PLACES = (("nycc", 0.9), ("udds", 0.9), ("nycc", 0.2), ("udds", 0.2))
 
 @dataclass(frozen=True)
 class Ablated:
-    """A program and what it saves against equal split, %, by place; None as `saving_percent` says."""
+    """A program: what it saves against equal split, and how often it changes the split, both by place.
+
+    `saving_percent` is None where the runs cannot be compared, as `Row.saving_percent` says.
+    """
 
     program: str
     meaning: str
     saving_percent: dict[str, float | None]
+    changes_per_min: dict[str, float]
 
 
 def ablation(
@@ -102,7 +106,12 @@ def ablation(
             *(_changed(base, name, steps, policies, folder, say) for name, steps in TOGETHER.items()),
             replace(base, strategy=STRATEGY, label=labels.OURS, policy=policies.ours("none", friction)),
         ]
+    say(f"driving {len(wanted)} cases")
     by = by_place(rows_of(drive_all(wanted, jobs)))
+    driven = {
+        f"{cycle} {friction:g}": by[Place(cycle, friction, "none")]
+        for cycle, friction in ((cases.cycle_of(path).name, friction) for path, friction in places)
+    }
     meanings = {
         labels.PAPER_SDP: VARIANTS[labels.PAPER_SDP].meaning,
         **{name: step.meaning for name, step in STEPS.items()},
@@ -114,10 +123,8 @@ def ablation(
         Ablated(
             program,
             meaning,
-            {
-                f"{cycle} {friction:g}": by[Place(cycle, friction, "none")][program].saving_percent
-                for cycle, friction in ((cases.cycle_of(path).name, friction) for path, friction in places)
-            },
+            {place: cell[program].saving_percent for place, cell in driven.items()},
+            {place: cell[program].metrics.share_changes_per_min for place, cell in driven.items()},
         )
         for program, meaning in meanings.items()
     ]
@@ -144,13 +151,15 @@ def _changed(
 
 
 def columns(rows: Sequence[Ablated]) -> list[Column[Ablated]]:
-    """The table's columns: a saving for each place."""
+    """The table's columns: saving and changes of the split for each place."""
 
-    def saving(place: str) -> Callable[[Ablated], float | None]:
-        return lambda row: row.saving_percent[place]
+    def of(values: str, place: str) -> Callable[[Ablated], float | None]:
+        return lambda row: getattr(row, values)[place]
 
+    places = rows[0].saving_percent
     return [
         Column("program", lambda row: row.program),
-        *(Column(place, saving(place), "%", 2, group="saving") for place in rows[0].saving_percent),
+        *(Column(place, of("saving_percent", place), "%", 2, group="saving") for place in places),
+        *(Column(place, of("changes_per_min", place), "1/min", 1, group="changes") for place in places),
         Column("what it is", lambda row: row.meaning),
     ]

@@ -10,9 +10,9 @@ import numpy as np
 
 from iwm_sim.study import labels, paper
 from iwm_sim.study.content import Study
-from iwm_sim.study.rows import Place, Row, by_place
+from iwm_sim.study.rows import Place, Row, by_place, most_saved
 
-#: Below this possible saving, %, nothing helps.
+#: Where no strategy saves as much as this, %, nothing helps.
 LITTLE_PERCENT = 0.15
 
 
@@ -52,16 +52,19 @@ def _holds(study: Study) -> str:
         for cycle in paper.CYCLES
         if cycle in study.cycles
     }
-    possible = {}
+    cells = by_place(study.cells)
+    reached = {}
     for idle_drive in ("none", "drag"):
-        found = {key: _saving(study, Place(*key, idle_drive), labels.FREE_BOUND) for key in printed}
-        possible[idle_drive] = sum(best is not None and best >= printed[key] for key, best in found.items())
+        found = {key: most_saved(cells.get(Place(*key, idle_drive), {})) for key in printed}
+        reached[idle_drive] = sum(best is not None and best >= printed[key] for key, best in found.items())
     made = study.paper
+    wh = made.wh_per_km.values()
+    without = made.mean_saving_without_nycc_on_ice_percent
     return (
-        f"Not in its numbers. Of its {len(printed)} printed savings, {possible['none']} are possible here if an idle "
-        f"axle costs nothing, {possible['drag']} if it drags. Their mean of {made.mean_saving_percent:.2f} % hangs on "
-        f"one cell, NYCC on ice; without that it is {made.mean_saving_without_nycc_on_ice_percent:.2f} %. Its "
-        f"depletions mean {min(made.wh_per_km.values()):.0f} to {max(made.wh_per_km.values()):.0f} Wh/km, on HWFET "
+        f"Not in its numbers. Of its {len(printed)} printed savings, {reached['none']} are within reach of some "
+        f"strategy here if an idle axle costs nothing, {reached['drag']} if it drags. Their mean of "
+        f"{made.mean_saving_percent:.2f} % hangs on one cell, NYCC on ice; without that it is {without:.2f} %. Its "
+        f"depletions mean {min(wh):.0f} to {max(wh):.0f} Wh/km, on HWFET "
         "a mean power that its motors cannot give. Its idea holds: letting one axle rest saves energy where an idle "
         "axle costs little, and "
         "avoiding skids ends locked wheels."
@@ -76,17 +79,20 @@ def _saving(study: Study, place: Place, label: str) -> float | None:
 def _program(study: Study) -> str:
     found = [value for idle in ("none", "drag") for value in savings(study, labels.PAPER_SDP, idle).values()]
     gains = sum(value > 0.0 for value in found)
-    by = {row.program: row.saving_percent for row in study.ablation}
-    place = next(iter(by[labels.PAPER_SDP]))
-    alone = by.get("look-ahead", {}).get(place)
+    by = {row.program: row for row in study.ablation}
+    printed = by[labels.PAPER_SDP].saving_percent
+    place = next(iter(printed))
+    ahead = by.get("look-ahead")
+    alone = ahead.saving_percent[place] if ahead else None
     text = (
         f"As printed, on its grid ({labels.PAPER_SDP}), it saves in {gains} of {len(found)} cells: "
         f"{min(found):.2f} to {max(found):.2f} %."
     )
-    if alone is not None:
+    if ahead and alone is not None:
         text += (
             f" What costs it most is interpolating shares between grid points: one step ahead on the same cost-to-go "
-            f"saves {alone:.2f} % instead of {by[labels.PAPER_SDP][place]:.2f} % ({place}, idle drive none)."
+            f"saves {alone:.2f} % instead of {printed[place]:.2f} %, at {ahead.changes_per_min[place]:.0f} changes of "
+            f"the split a minute ({place}, idle drive none)."
         )
     return text
 
@@ -124,19 +130,22 @@ def _rival(study: Study) -> str:
 
 
 def _nothing(study: Study) -> str:
+    most = {place: saving for place, cell in by_place(study.cells).items() if (saving := most_saved(cell)) is not None}
     little = [
         f"{place.cycle} at friction {place.friction:g}"
-        for place, saving in savings(study, labels.FREE_BOUND, "drag").items()
-        if saving < LITTLE_PERCENT
+        for place, saving in most.items()
+        if place.idle_drive == "drag" and saving < LITTLE_PERCENT
     ]
-    none, drag = (list(savings(study, labels.FREE_BOUND, idle_drive).values()) for idle_drive in ("none", "drag"))
+    none, drag = (
+        [saving for place, saving in most.items() if place.idle_drive == idle_drive] for idle_drive in ("none", "drag")
+    )
     where = ""
     if little:
-        where = f"With an idle axle that drags, less than {LITTLE_PERCENT} % is possible on {_listed(little)}. "
+        where = f"With an idle axle that drags, no strategy saves {LITTLE_PERCENT} % on {_listed(little)}. "
     return (
-        f"{where}With the whole cycle known and changes free, {min(drag):.2f} to {max(drag):.2f} % is possible with "
-        f"idle drive drag, {min(none):.2f} to {max(none):.2f} % with none: what an idle axle costs decides more than "
-        "the strategy does."
+        f"{where}The best of all strategies, those that know the whole cycle and change the split at will included, "
+        f"saves {min(drag):.2f} to {max(drag):.2f} % with idle drive drag, {min(none):.2f} to {max(none):.2f} % with "
+        "none: what an idle axle costs decides more than the strategy does."
     )
 
 
@@ -151,6 +160,7 @@ WORDS = {
     "paper_sdp": "the paper's stochastic program on the paper's grid, decided every 0.1 s",
     "ours": "strategy sdp_lookahead: one step ahead on the cost-to-go of grid coupled, decided every 0.02 s",
     "preview": "dynamic programming with the whole cycle known in advance; its budget or price of changes is beside it",
+    "possible": "what preview saves with our budget of changes of the split; with more changes more can be saved",
     "instantaneous": "least battery power now; instantaneous_slip counts slip and load transfer, and a change has to "
     "save the power named beside it",
     "share": "front power over power demand, 0..1; a change of it by more than 0.25 counts",

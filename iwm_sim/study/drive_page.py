@@ -18,6 +18,8 @@ from iwm_sim.study.report import format_value as shown
 from iwm_sim.study.rows import finite, saving_percent
 
 BLUE, VERMILION, GREEN, PURPLE, OCHRE, SKY, GREY, BLACK = range(8)
+#: Below it a car stands.
+STANDING_MPS = 0.1
 
 
 class Driven(NamedTuple):
@@ -137,7 +139,8 @@ def drive_page(
         Text(
             "Powers are those of the commands at the wheels, braking negative. Slip is the wheel's, drawn above "
             f"{MOVING_MPS:g} m/s. A gate holds an axle at zero torque while its slip is beyond the critical one. "
-            "Energy saved is the reference's battery energy up to the same time, less this run's.",
+            "Energy saved is the reference's battery energy up to the same time, less this run's. While the car stands "
+            "brakes hold it, no power flows, and the split keeps what it was at the last stop: it is not drawn.",
             "How to read it",
         ),
         Settings("Settings", settings),
@@ -179,13 +182,14 @@ def _panels(driven: Driven, reference: Driven, critical_slip: float) -> list[Pan
         ),
     ]
     if not np.isnan(run["front_share"]).all():
+        standing = run["speed_mps"] < STANDING_MPS
         panels.append(
             Panel(
                 "Front share",
                 "",
                 [
-                    Series("applied", run["front_share"], BLUE),
-                    Series("decided", run["decided_share"], GREY, dashed=True, step=True),
+                    Series("applied", np.where(standing, np.nan, run["front_share"]), BLUE),
+                    Series("decided", np.where(standing, np.nan, run["decided_share"]), GREY, dashed=True, step=True),
                 ],
                 limits=(0.0, 1.0),
             )

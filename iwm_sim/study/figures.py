@@ -175,10 +175,10 @@ def policy_convergence(policy_change: ArrayLike, bellman_residual: ArrayLike | N
     # Linear below the smallest change: the last iteration changes nothing, and a log axis has no zero.
     positive = change[change > 0.0]
     axes[0].set_yscale("symlog", linthresh=float(positive.min()) if len(positive) else 1.0)
-    axes[0].set_ylabel("Change of the policy, share")
+    axes[0].set_ylabel("Change of shares")
     if bellman_residual is not None:
         axes[1].semilogy(iteration, bellman_residual, "s-", color=VERMILION, markersize=4)
-        axes[1].set_ylabel("Bellman residual")
+        axes[1].set_ylabel("Bellman residual, J")
     axes[-1].set_xlabel("Iteration")
     axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     return figure

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write, read_text
+from iwm_power_manager.tools.command import write_picture
 from iwm_sim.study.answers import WORDS, answers
 from iwm_sim.study.content import Study
 from iwm_sim.study.report import Block, Page, Picture, Pictures, Settings, Table, Text, write_page
@@ -25,12 +25,10 @@ TITLE = "A stochastic power split, reproduced and compared"
 
 def write(output: Path, study: Study, pictures: Sequence[Drawn]) -> None:
     """Write page, Markdown tables and pictures into a folder."""
-    for picture in pictures:
-        stream = io.BytesIO()
-        picture.figure.savefig(stream, format="svg", facecolor="white", metadata={"Date": None})
-        atomic_write(output / "figures" / f"{picture.file}.svg", stream.getvalue())
     atomic_write(output / "study.md", f"# {TITLE}\n\n{markdown(study)}\n".encode())
     write_page(output / "study.html", page(study, pictures))
+    for picture in pictures:
+        write_picture(output / "figures" / f"{picture.file}.svg", picture.captioned())
 
 
 def update_document(path: Path, study: Study) -> None:

@@ -111,6 +111,14 @@ def by_place(rows: Iterable[Row]) -> dict[Place, dict[str, Row]]:
     return result
 
 
+def most_saved(cell: Mapping[str, Row]) -> float | None:
+    """The most that any strategy saves in a place, %, however often it changes the split; None if none can be compared.
+
+    The strategies that know the whole cycle are among them.
+    """
+    return max((row.saving_percent for row in cell.values() if row.saving_percent is not None), default=None)
+
+
 def rows_of(results: Sequence[Result]) -> list[Row]:
     """A row for each result, with its saving against the equal split of the same drive.
 

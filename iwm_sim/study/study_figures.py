@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ from iwm_sim.study.study_tables import BATTERY, FRONTIER, PROGRAM, SENSITIVITY, 
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Of all figures, and of the paper's eq. 23.
+_IDLE = "idle drive none"
 #: When Figures 14 and 15 look.
 WINDOW_S = (345.0, 430.0)
 
@@ -52,6 +55,12 @@ class Drawn(NamedTuple):
     figure: Figure
     section: str = ""
 
+    def captioned(self) -> Figure:
+        """The figure with title and note above it, for where no page says them."""
+        text = f"{self.title}\n{textwrap.fill(self.note, 88, break_on_hyphens=False)}"
+        self.figure.suptitle(text, x=0.01, horizontalalignment="left", fontsize=8.0)
+        return self.figure
+
 
 def drawn(frontier: Frontier, material: Material, vehicle: VehicleParams) -> list[Drawn]:
     """All figures of a study."""
@@ -70,7 +79,8 @@ def battery_figure(fit: battery_fit.Fit) -> Drawn:
     return Drawn(
         "figure_07_battery",
         "Figure 7: plant and control model",
-        "Speed and state of charge, equal split; the control model has a static circuit, fitted.",
+        f"Speed and state of charge, equal split, idle drive {fit.idle_drive}; the control model has a static circuit, "
+        "fitted.",
         figures.model_comparison(*fit.comparison),
         BATTERY,
     )
@@ -82,7 +92,7 @@ def depletion_figures(vehicle: VehicleParams) -> list[Drawn]:
         Drawn(
             "figure_08_speed",
             "Figure 8: depletion over the split, by speed",
-            f"Demand {sensitivity.FIG_8_DEMAND_W / 1000:g} kW, both slips 0.01.",
+            f"Demand {sensitivity.FIG_8_DEMAND_W / 1000:g} kW, both slips 0.01, {_IDLE}.",
             figures.depletion_over_split(sensitivity.figure_8(vehicle)),
             SENSITIVITY,
         ),
@@ -90,14 +100,14 @@ def depletion_figures(vehicle: VehicleParams) -> list[Drawn]:
             "figure_09_slip",
             "Figure 9: depletion over the split, by front slip",
             f"{sensitivity.FIG_9_SPEED_MPS:g} m/s, demand {sensitivity.FIG_9_DEMAND_W / 1000:g} kW at the wheels, rear "
-            "slip 0.01.",
+            f"slip 0.01, {_IDLE}.",
             figures.depletion_over_split(sensitivity.figure_9(vehicle)),
             SENSITIVITY,
         ),
         Drawn(
             "figure_10_demand",
             "Figure 10: depletion over the split, by demand",
-            f"{sensitivity.FIG_10_SPEED_MPS:g} m/s, both slips 0.01.",
+            f"{sensitivity.FIG_10_SPEED_MPS:g} m/s, both slips 0.01, {_IDLE}.",
             figures.depletion_over_split_panels(sensitivity.figure_10(vehicle)),
             SENSITIVITY,
         ),
@@ -110,8 +120,8 @@ def solver_figures(convergence: tuple[FloatArray, FloatArray], chain: tuple[Floa
         Drawn(
             "figure_12_convergence",
             "Figure 12: policy iteration",
-            "The paper's problem, friction 0.9: change of the policy in each iteration, and the Bellman residual, "
-            "which bounds the distance from the optimal cost-to-go.",
+            f"The paper's problem, friction 0.9, {_IDLE}: change of the policy in each iteration, and the Bellman "
+            "residual, which bounds the distance from the optimal cost-to-go.",
             figures.policy_convergence(*convergence),
             PROGRAM,
         ),
@@ -132,7 +142,7 @@ def rule_figure(rule: Rule) -> Drawn:
     return Drawn(
         "figure_13_rule",
         "Figure 13: the generalized rule",
-        "Dynamic programming on FTP-75, friction 0.9, and the line fitted to it.",
+        f"Dynamic programming on FTP-75, friction 0.9, {_IDLE}, and the line fitted to it.",
         figures.fitted_rule(demand, rule.front_share * demand, line_w, _rule_power(rule.coefficients, line_w)),
         TABLES,
     )
@@ -154,14 +164,14 @@ def window_figures(window: dict[str, dict[str, FloatArray]]) -> list[Drawn]:
         Drawn(
             "figure_14_powers",
             "Figure 14: powers of the axles",
-            "Friction 0.2, idle drive none.",
+            f"UDDS, friction 0.2, {_IDLE}.",
             figures.axle_powers(time_s, powers, span),
             TABLE_6,
         ),
         Drawn(
             "figure_15_slips",
             "Figure 15: slips with and without skid avoidance",
-            "Friction 0.2, idle drive none: the paper's SDP without skid avoidance, and ours.",
+            f"UDDS, friction 0.2, {_IDLE}: the paper's SDP without skid avoidance, and ours.",
             figures.slips(time_s, slips, CRITICAL_SLIP, span),
             TABLE_6,
         ),

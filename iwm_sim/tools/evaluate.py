@@ -14,7 +14,7 @@ from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
-from iwm_power_manager.tools.command import described, ended
+from iwm_power_manager.tools.command import described, ended, picture
 from iwm_power_manager.tools.options import add_setting, number, several, whole
 from iwm_sim.study.names import DEFAULT_GRID, FIGURES, MAX_DT_S, REFERENCE, TABLES, cores
 from iwm_sim.study.variants import VARIANTS
@@ -46,8 +46,8 @@ examples:
 
   A cell of the paper's Table 3, a figure of it, and why its program loses here:
     evaluate --paper 3 --cycle nycc --idle-drive none
-    evaluate --figure 12 --plot figure_12.svg
-    evaluate --ablation
+    evaluate --figure 12 --plot figure_12.pdf
+    evaluate --ablation                         (3 min)
 
   The battery's resistance as the paper estimates it (eq. 25), with the comparison plot:
     evaluate --fit-battery --plot battery.svg
@@ -68,7 +68,7 @@ LAW_OPTIONS = ("decision_period_s", "gate_mode", "gate_driving", "critical_slip"
 _COMMON = {"--vehicle", "--policy", "--jobs", "--quiet"}
 MODES = {
     "study": _COMMON | {"--study", "--update-doc"},
-    "paper": _COMMON | {"--paper", "--cycle", "--idle-drive"},
+    "paper": _COMMON | {"--paper", "--cycle", "--idle-drive", "--json"},
     "figure": _COMMON | {"--figure", "--plot"},
     "ablation": _COMMON | {"--ablation", "--json"},
     "frontier": {"--frontier", "--vehicle", "--idle-drive", "--cycle", "--friction", "--budgets", "--quiet"},
@@ -194,7 +194,11 @@ def _add_simulation(group: argparse._ArgumentGroup) -> None:
 
 
 def _add_output(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--json", metavar="FILE", help="a row for each case, with its settings and hashes")
+    group.add_argument(
+        "--json",
+        metavar="FILE",
+        help="a row for each case, with settings and hashes; or what was asked for instead",
+    )
     group.add_argument("--save-series", metavar="DIR", help="a .npz for each case, with an array for each signal")
     group.add_argument("--quiet", action="store_true", help="no progress, no table")
 
@@ -225,7 +229,7 @@ def _add_modes(parent: argparse._ArgumentGroup) -> None:
     parent.add_argument("--seeds", type=whole(0, 10**9), default=1000, metavar="FIRST", help="--unseen: first seed")
     parent.add_argument("--cycles", type=whole(0, 10_000), default=200, metavar="N", help="--unseen: cycles drawn")
     parent.add_argument("--cars", type=whole(0, 10_000), default=20, metavar="N", help="--unseen: cars drawn")
-    parent.add_argument("--plot", metavar="SVG|PNG", help="--figure, --fit-battery: the picture")
+    parent.add_argument("--plot", type=picture, metavar="PICTURE", help="--figure, --fit-battery: .pdf, .png or .svg")
     parent.add_argument(
         "--update-doc", metavar="MD", help="--study: also replace the generated part of this file (docs/study.md)"
     )

@@ -17,7 +17,7 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.feasible import trace_warnings
-from iwm_power_manager.tools.command import write_json
+from iwm_power_manager.tools.command import PICTURES, write_json, write_picture
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.road_report import text as road_text
 from iwm_sim.road_run import check_scenario
@@ -26,7 +26,6 @@ from iwm_sim.study import (
     ablation,
     battery_fit,
     cases,
-    figures,
     frontier,
     frontier_figure,
     paper,
@@ -40,6 +39,8 @@ from iwm_sim.study.names import REFERENCE, TABLES
 from iwm_sim.study.plan import Policies
 from iwm_sim.study.policies import PolicySource
 from iwm_sim.study.rows import Row, rows_of
+from iwm_sim.study.study_figures import battery_figure
+from iwm_sim.study.study_tables import ABLATION_NOTE
 from iwm_sim.study.tables import plain_table, text_table
 from iwm_sim.study.variants import VARIANTS
 
@@ -221,9 +222,14 @@ def _paper(options: argparse.Namespace) -> None:
     for cycle in cycles:
         cases.cycle_of(cycle)
     policies = Policies(options.vehicle, options.policy, say)
-    for table in single.paper_table(options.paper, policies, cycles, idle_drives, options.jobs):
-        print(f"{table.title or table.section}\n{plain_table(table.rows, table.columns)}\n")
-    print(f"{table.note}\n{_policies_text(policies, options.paper, idle_drives)}")
+    tables = single.paper_table(options.paper, policies, cycles, idle_drives, options.jobs)
+    if not options.quiet:
+        for table in tables:
+            print(f"{table.title or table.section}\n{plain_table(table.rows, table.columns)}\n")
+        print(f"{table.note}\n{_policies_text(policies, options.paper, idle_drives)}")
+    if options.json:
+        rows = [row.to_json() for table in tables for cell in table.rows for row in cell.values()]
+        write_json(options.json, {"package_version": __version__, "table": options.paper, "rows": rows})
 
 
 def _policies_text(policies: Policies, table: str, idle_drives: Sequence[str]) -> str:
@@ -242,11 +248,10 @@ def _policies_text(policies: Policies, table: str, idle_drives: Sequence[str]) -
 
 def _figure(options: argparse.Namespace) -> None:
     if not options.plot:
-        raise ConfigError("arguments", "--plot", "is missing", "a file that ends in .svg or .png")
-    battery_fit.check_picture(options.plot)
+        raise ConfigError("arguments", "--plot", "is missing", f"a file that ends in {', '.join(PICTURES)}")
     policies = Policies(options.vehicle, options.policy, silent if options.quiet else tell)
     drawn = single.figure(options.figure, policies, options.jobs)
-    battery_fit.save_picture(drawn.figure, options.plot)
+    write_picture(options.plot, drawn.captioned())
     if not options.quiet:
         print(f"{drawn.title}. {drawn.note}\npicture: {options.plot}")
 
@@ -256,15 +261,13 @@ def _ablation(options: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory(prefix="iwm-ablation-") as folder:
         rows = ablation.ablation(Policies(options.vehicle, options.policy, say), Path(folder), options.jobs, say)
     if not options.quiet:
-        print(plain_table(rows, ablation.columns(rows)))
+        print(f"{plain_table(rows, ablation.columns(rows))}\n{ABLATION_NOTE}")
     if options.json:
         content = {"package_version": __version__, "rows": [dataclasses.asdict(row) for row in rows]}
         write_json(options.json, content)
 
 
 def _fit_battery(options: argparse.Namespace) -> None:
-    if options.plot:
-        battery_fit.check_picture(options.plot)
     fit = battery_fit.fit(
         options.vehicle,
         (options.idle_drive or [""])[0],
@@ -275,7 +278,7 @@ def _fit_battery(options: argparse.Namespace) -> None:
     if not options.quiet:
         print(fit.text())
     if options.plot:
-        battery_fit.save_picture(figures.model_comparison(*fit.comparison), options.plot)
+        write_picture(options.plot, battery_figure(fit).captioned())
         tell(f"picture: {options.plot}")
     if options.json:
         write_json(options.json, fit.to_json())
@@ -311,7 +314,7 @@ def _frontier(options: argparse.Namespace) -> None:
         for name in options.cycle:
             cycle = cases.cycle_of(name)
             for friction in options.friction or [0.9]:
-                label = f"{vehicle.name}, {vehicle.idle_drive}, {cycle.name}, friction {friction:g}"
+                label = f"{vehicle.name}, idle drive {vehicle.idle_drive}, {cycle.name}, friction {friction:g}"
                 place = frontier.Place(label, vehicle, cycle, friction)
                 with tempfile.TemporaryDirectory() as policies:
                     found.append(unseen.budgets_of(place, options.budgets or frontier.BUDGETS_PER_MIN, Path(policies)))

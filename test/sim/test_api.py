@@ -38,6 +38,15 @@ def test_a_share_map_has_the_axes_of_its_policy_and_a_picture(bank):
     assert not np.array_equal(share, api.share_map(policy, previous_share=0.0)[2])
     figure = api.plot_share(policy)
     assert figure.axes[0].get_ylabel() == "Power demand, kW"
+    assert "idle drive drag" in figure.axes[0].get_title()
+
+
+def test_a_printed_policy_is_one_line_that_says_which_it_is(bank):
+    policy = bank.nearest(0.9)
+    (line,) = repr(policy).splitlines()
+    for said in ("jalalmaab_2015", "idle drive drag", "friction 0.9", policy.problem.name, policy.checksum[:12]):
+        assert said in line
+    assert len(line) < 200
 
 
 def test_a_drive_gives_metrics_a_saving_and_a_frame(car, bank):
@@ -63,7 +72,13 @@ def test_bad_input_is_one_line(car, bank):
         api.drive("nycc", other, 0.9, bank.nearest(0.9))
 
 
-@pytest.mark.parametrize("page", ["solver.md", "study.md"])
+def test_the_page_names_every_column_of_a_frame():
+    page = (DOCS / "python.md").read_text()
+    rows = re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} | {"time_s"} == set(COLUMNS)
+
+
+@pytest.mark.parametrize("page", ["solver.md", "python.md"])
 def test_what_the_pages_show_runs(page, tmp_path, monkeypatch):
     snippets = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
     assert snippets

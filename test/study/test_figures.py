@@ -33,7 +33,7 @@ def figures():
 
 
 def test_every_number_axis_is_labelled_with_its_unit(figures):
-    unitless = {"Iteration", "Bellman residual", "(a) Front slip", "(b) Rear slip", "Probability", ""}
+    unitless = {"Iteration", "Change of shares", "(a) Front slip", "(b) Rear slip", "Probability", ""}
     for name, figure in figures.items():
         labels = [axis.get_ylabel() for axis in figure.axes] + [axis.get_xlabel() for axis in figure.axes]
         assert figure.axes[0].get_ylabel(), name

@@ -138,19 +138,31 @@ def test_a_grid_that_is_asked_for_is_used_or_refused(hill, small_policy, small_g
     assert "was solved on grid small, not on fine" in capsys.readouterr().err
 
 
-def test_a_figure_is_drawn_alone(tmp_path, capsys):
-    assert evaluate.main(["--figure", "9", "--plot", str(tmp_path / "nine.svg")]) == 0
+@pytest.mark.parametrize(("ending", "begin"), [("svg", b"<?xml"), ("pdf", b"%PDF"), ("png", b"\x89PNG")])
+def test_a_figure_is_drawn_alone_as_what_its_name_ends_in(ending, begin, tmp_path, capsys):
+    assert evaluate.main(["--figure", "9", "--plot", str(tmp_path / f"nine.{ending}")]) == 0
     assert "Figure 9" in capsys.readouterr().out
-    assert (tmp_path / "nine.svg").read_text().lstrip().startswith("<?xml")
+    assert (tmp_path / f"nine.{ending}").read_bytes().lstrip().startswith(begin)
+
+
+def test_a_figure_says_what_it_was_drawn_for(tmp_path, capsys):
+    assert evaluate.main(["--figure", "8", "--plot", str(tmp_path / "eight.svg")]) == 0
+    assert "idle drive none" in capsys.readouterr().out
+    assert "idle drive none" in (tmp_path / "eight.svg").read_text()  # matplotlib notes each text in a comment
+
+
+def test_a_figure_needs_a_file(capsys):
     assert evaluate.main(["--figure", "9"]) == 2
     assert "--plot: is missing" in capsys.readouterr().err
 
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("table", ["3", "6"])
-def test_a_cell_of_the_papers_tables_is_that_of_the_study(table, capsys):
-    assert evaluate.main(["--paper", table, "--cycle", "nycc", "--idle-drive", "none"]) == 0
+def test_a_cell_of_the_papers_tables_is_that_of_the_study(table, tmp_path, capsys):
+    out = tmp_path / "table.json"
+    assert evaluate.main(["--paper", table, "--cycle", "nycc", "--idle-drive", "none", "--json", str(out)]) == 0
     shown = capsys.readouterr().out
+    assert {"ED", "ours"} <= {row["label"] for row in rows_of(out)}
     stored = Study.load(ROOT / "docs" / "study.json")
     (ours,) = (row for row in stored.cells if row.place == ("nycc", 0.9, "none") and row.label == "ours")
     assert f"{ours.metrics.delta_soc_percent:.3f}" in shown
@@ -166,7 +178,6 @@ def test_a_cell_of_the_papers_tables_is_that_of_the_study(table, capsys):
         (["--cycle", "nycc", "--policy", "no_such_folder"], "neither a policy file nor a folder"),
         (["--cycle", "nycc", "--strategy", "preview", "--switching-cost", "1", "--dt", "0.013"], "does not divide"),
         (["--cycle", "nycc", "--strategy", "equal", "--save-series", "/dev/null/x"], "cannot be created"),
-        (["--fit-battery", "--cycle", "nycc", "--plot", "picture.txt"], "is no picture's name"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(arguments, words, capsys):
