@@ -206,12 +206,22 @@ def estimate(
         front_n, rear_n = normal_forces_n(force / vehicle.chassis.mass_kg, 0.0, 0.0, vehicle.chassis)
         front_n, rear_n = max(front_n, 1.0), max(rear_n, 1.0)
         w = wheel_speed_radps
+        front_alike = wheels[0] == wheels[1] and w[0] == w[1] and a == b
+        rear_alike = wheels[2] == wheels[3] and w[2] == w[3] and c == d
         a, left_front = _wheel(a, wheels[0], w[0], speed_mps, front_n, dt_s, settings, front)
-        b, right_front = _wheel(b, wheels[1], w[1], speed_mps, front_n, dt_s, settings, front)
         c, left_rear = _wheel(c, wheels[2], w[2], speed_mps, rear_n, dt_s, settings, rear)
-        d, right_rear = _wheel(d, wheels[3], w[3], speed_mps, rear_n, dt_s, settings, rear)
-    left = _side(before.left, a, c, left_front, left_rear, dt_s, settings, front)
-    right = _side(before.right, b, d, right_front, right_rear, dt_s, settings, front)
+        if front_alike:
+            b, right_front = a, left_front
+        else:
+            b, right_front = _wheel(b, wheels[1], w[1], speed_mps, front_n, dt_s, settings, front)
+        if rear_alike:
+            d, right_rear = c, left_rear
+        else:
+            d, right_rear = _wheel(d, wheels[3], w[3], speed_mps, rear_n, dt_s, settings, rear)
+    left = right = _side(before.left, a, c, left_front, left_rear, dt_s, settings, front)
+    alike = a == b and c == d and before.left == before.right
+    if not (alike and left_front == right_front and left_rear == right_rear):
+        right = _side(before.right, b, d, right_front, right_rear, dt_s, settings, front)
     lower = min(left.friction, right.friction)
     assumed = before.assumed
     if abs(lower - assumed) > DEAD_BAND:

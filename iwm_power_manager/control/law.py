@@ -335,12 +335,16 @@ def _after(wheel: Wheel, motor_nm: float, total_nm: float, before: WheelState, d
 
 
 class Pair(NamedTuple):
-    """The two wheels of an axle in one step, and what its yaw budget leaves each, N m."""
+    """The two wheels of an axle in one step, and what its yaw budget leaves each, N m.
+
+    Wheels that are `alike` in all that is known of them need to be worked out once.
+    """
 
     left: Wheel
     right: Wheel
     left_room_nm: float
     right_room_nm: float
+    alike: bool
 
 
 class Shared(NamedTuple):
@@ -378,6 +382,7 @@ def _pair(
     first: bool,
     left_before: WheelState,
     right_before: WheelState,
+    alike: bool,
     axle: Axle,
     settings: Settings,
     vehicle: VehicleParams,
@@ -391,12 +396,14 @@ def _pair(
         left_radps, left_slip, left_gate, speed_mps, demand, left_gain, lower_part, gate_mode, slip_target, dt, first,
         left_before, right_radps, right_before, axle, settings, vehicle,
     )  # fmt: skip
-    right = _wheel(
-        right_radps, right_slip, right_gate, speed_mps, demand, right_gain, lower_part, gate_mode, slip_target, dt,
-        first, right_before, left_radps, left_before, axle, settings, vehicle,
-    )  # fmt: skip
+    right = left
+    if not alike:
+        right = _wheel(
+            right_radps, right_slip, right_gate, speed_mps, demand, right_gain, lower_part, gate_mode, slip_target, dt,
+            first, right_before, left_radps, left_before, axle, settings, vehicle,
+        )  # fmt: skip
     left_room, right_room = _rooms_nm(left, right, moment_nm, axle)
-    return Pair(left, right, left_room, right_room)
+    return Pair(left, right, left_room, right_room, alike)
 
 
 @kernel
@@ -422,7 +429,9 @@ def _shared(
         given_w, pair.left.conversion_radps, pair.right.conversion_radps, pair.left_room_nm, pair.right_room_nm
     )
     left = _given(sign * left_nm, pair.left, speed_mps, braking, dt_s, left_before, settings, axle)
-    right = _given(sign * right_nm, pair.right, speed_mps, braking, dt_s, right_before, settings, axle)
+    right = left
+    if not pair.alike:
+        right = _given(sign * right_nm, pair.right, speed_mps, braking, dt_s, right_before, settings, axle)
     return Shared(left, right, left_nm, right_nm)
 
 
@@ -466,10 +475,13 @@ def drive(
 
     # 1. slip, wheel by wheel; an axle's is that of its worse wheel
     w = measurement.wheel_speed_radps
+    gain, stuck = measurement.motor_gain, measurement.motor_stuck_nm
+    front_alike = w[0] == w[1] and fl0 == fr0 and gain[0] == gain[1] and stuck[0] == stuck[1]
+    rear_alike = w[2] == w[3] and rl0 == rr0 and gain[2] == gain[3] and stuck[2] == stuck[3]
     fl_slip = _slip(w[0], speed, dt, first, fl0, vehicle.front, settings)
-    fr_slip = _slip(w[1], speed, dt, first, fr0, vehicle.front, settings)
+    fr_slip = fl_slip if front_alike else _slip(w[1], speed, dt, first, fr0, vehicle.front, settings)
     rl_slip = _slip(w[2], speed, dt, first, rl0, vehicle.rear, settings)
-    rr_slip = _slip(w[3], speed, dt, first, rr0, vehicle.rear, settings)
+    rr_slip = rl_slip if rear_alike else _slip(w[3], speed, dt, first, rr0, vehicle.rear, settings)
     front_slip = worse_slip(fl_slip, fr_slip)
     rear_slip = worse_slip(rl_slip, rr_slip)
 
@@ -486,14 +498,13 @@ def drive(
         s.front_yaw_nm, s.front_yaw_growth_nmps, s.front_yaw_most_nm, state.front_unequal_s, braking
     )
     rear_yaw = _yaw_moment_nm(s.rear_yaw_nm, s.rear_yaw_growth_nmps, s.rear_yaw_most_nm, state.rear_unequal_s, braking)
-    gain = measurement.motor_gain
     front = _pair(
         measurement, w[0], w[1], fl_slip, fr_slip, speed, gain[0], gain[1], lower_part, mode, target, front_yaw, first,
-        fl0, fr0, vehicle.front, settings, vehicle,
+        fl0, fr0, front_alike, vehicle.front, settings, vehicle,
     )  # fmt: skip
     rear = _pair(
         measurement, w[2], w[3], rl_slip, rr_slip, speed, gain[2], gain[3], lower_part, mode, target, rear_yaw, first,
-        rl0, rr0, vehicle.rear, settings, vehicle,
+        rl0, rr0, rear_alike, vehicle.rear, settings, vehicle,
     )  # fmt: skip
     return _commanded(measurement, speed, front, rear, front_slip, rear_slip, memory, state, settings, vehicle)
 
