@@ -4,8 +4,8 @@
 Beyond the control-oriented model it moves in the plane (`iwm_sim.double_track`), forwards and backwards, and has four
 wheels of their own, motors that heat up and derate, and a battery whose open-circuit voltage and resistance depend on
 its charge, with a polarisation branch. It obeys commands only as far as its motors can. Where left and right are alike,
-nothing steers and the car rolls forwards, the motion in the plane is a straight line, and `model.longitudinal` solves
-it: the same equations without their lateral half.
+nothing steers and the car rolls forwards, the motion in the plane is a straight line, and `model.two_axles` solves it:
+the same equations without their lateral half.
 
 Every joule is booked. Within a step forces and torques are constant, so their work is exact with the mean of the speeds
 before and after, and
@@ -21,12 +21,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
+from iwm_power_manager.grid import interpolate1, locate
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import current_a
 from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n
-from iwm_power_manager.model.longitudinal import Four, step
+from iwm_power_manager.model.longitudinal import Four
 from iwm_power_manager.model.motor import (
     electrical_power_w,
     heat_after,
@@ -35,6 +34,7 @@ from iwm_power_manager.model.motor import (
     torque_limit_nm,
 )
 from iwm_power_manager.model.parameters import Axle, Battery, Motor, VehicleParams
+from iwm_power_manager.model.two_axles import Speeds, Torques, step_onward
 from iwm_sim import double_track
 
 
@@ -145,7 +145,7 @@ def initial_plant(vehicle: VehicleParams, soc: float = 0.8, speed_mps: float = 0
 @kernel
 def open_circuit_v(soc: float, battery: Battery) -> float:
     """Open-circuit voltage of the pack, V."""
-    return battery.cells_in_series * np.interp(soc, battery.ocv_soc, battery.ocv_cell_v)
+    return battery.cells_in_series * interpolate1(battery.ocv_cell_v, *locate(battery.ocv_soc, soc))
 
 
 @kernel
@@ -252,42 +252,44 @@ def _straight(
     vehicle: VehicleParams,
 ) -> double_track.PlaneMotion:
     """The step along a straight line, as motion in the plane."""
-    grade = surroundings.grade
-    motion = step(
-        state.speed_mps,
-        state.wheel_speed_radps,
+    grade, friction, wheels = surroundings.grade, surroundings.friction, state.wheel_speed_radps
+    before = Speeds(state.speed_mps, wheels[0], wheels[2])
+    moved = step_onward(
+        before,
+        Torques(motors[0], motors[2], resisting[0], resisting[2]),
         state.acceleration_mps2,
-        motors,
-        resisting,
         grade,
-        surroundings.friction,
+        (friction[0], friction[2]),
         dt_s,
         vehicle,
     )
-    mean_speed = 0.5 * (state.speed_mps + motion.speed_mps)
-    slipped = 0.0
-    for i in range(4):
-        radius = vehicle.front.wheel.radius_m if i < 2 else vehicle.rear.wheel.radius_m
-        mean_wheel = 0.5 * (state.wheel_speed_radps[i] + motion.wheel_speed_radps[i])
-        slipped += motion.tyre_force_n[i] * (radius * mean_wheel - mean_speed)
-    acceleration = (motion.speed_mps - state.speed_mps) / dt_s
-    front, rear = normal_forces_n(acceleration, motion.speed_mps, grade, vehicle.chassis)
-    held = motion.resisting_torque_nm
+    after = moved.speeds
+    mean_speed = 0.5 * (before.car_mps + after.car_mps)
+    front_rim = vehicle.front.wheel.radius_m * (0.5 * (before.front_radps + after.front_radps))
+    rear_rim = vehicle.rear.wheel.radius_m * (0.5 * (before.rear_radps + after.rear_radps))
+    slipped = moved.front_force_n * (front_rim - mean_speed) + moved.rear_force_n * (rear_rim - mean_speed)
+    acceleration = (after.car_mps - before.car_mps) / dt_s
+    front, rear = normal_forces_n(acceleration, after.car_mps, grade, vehicle.chassis)
     return double_track.PlaneMotion(
-        speed_mps=motion.speed_mps,
+        speed_mps=after.car_mps,
         lateral_speed_mps=0.0,
         yaw_rate_radps=0.0,
-        wheel_speed_radps=motion.wheel_speed_radps,
+        wheel_speed_radps=(after.front_radps, after.front_radps, after.rear_radps, after.rear_radps),
         acceleration_mps2=acceleration,
         lateral_acceleration_mps2=0.0,
         normal_force_n=(front, front, rear, rear),
-        holding_torque_nm=(-held[0], -held[1], -held[2], -held[3]),
+        holding_torque_nm=(
+            -moved.front_resisting_nm,
+            -moved.front_resisting_nm,
+            -moved.rear_resisting_nm,
+            -moved.rear_resisting_nm,
+        ),
         turned_rad=0.0,
         mean_speed_mps=mean_speed,
         mean_lateral_mps=0.0,
-        rolling_force_n=motion.rolling_force_n,
-        air_force_n=aerodynamic_force_n(motion.speed_mps, vehicle.chassis),
-        slip_work_w=slipped,
+        rolling_force_n=moved.rolling_force_n,
+        air_force_n=aerodynamic_force_n(after.car_mps, vehicle.chassis),
+        slip_work_w=2.0 * slipped,
     )
 
 
@@ -324,20 +326,27 @@ def _moved(
     )
 
 
+class _Work(NamedTuple):
+    """One wheel over a step: power of its motor, and what brake and drag took, W; torque of the brake, N m."""
+
+    electrical_w: float
+    shaft_w: float
+    braked_w: float
+    dragged_w: float
+    braking_nm: float
+
+
 @kernel
 def _wheel_work(
     i: int, state: PlantState, motion: double_track.PlaneMotion, motors: Four, brakes: Four, drags: Four, motor: Motor
-) -> tuple[float, float, float, float, float]:
-    """One wheel over a step: electrical and shaft power, what brake and drag took (W), and the brake's torque (N m)."""
+) -> _Work:
     mean_wheel = 0.5 * (state.wheel_speed_radps[i] + motion.wheel_speed_radps[i])
     held = motion.holding_torque_nm[i]
     exerted = _brake_part(-held, brakes[i], drags[i])
     # Running backwards, a motor does with both signs turned what it does forwards.
-    if mean_wheel < 0.0:
-        power = electrical_power_w(-motors[i], -mean_wheel, motor)
-    else:
-        power = electrical_power_w(motors[i], mean_wheel, motor)
-    return power, motors[i] * mean_wheel, exerted * mean_wheel, (-held - exerted) * mean_wheel, exerted
+    sign = -1.0 if mean_wheel < 0.0 else 1.0
+    power = electrical_power_w(sign * motors[i], sign * mean_wheel, motor)
+    return _Work(power, motors[i] * mean_wheel, exerted * mean_wheel, (-held - exerted) * mean_wheel, exerted)
 
 
 @kernel
@@ -361,17 +370,17 @@ def _substep(
     )
     resisting = (brakes[0] + drags[0], brakes[1] + drags[1], brakes[2] + drags[2], brakes[3] + drags[3])
     motion = _moved(state, motors, resisting, steer_rad, surroundings, h, vehicle)
-    power = 0.0
-    shaft = 0.0
-    braked = 0.0
-    dragged = 0.0
-    for i in range(4):
-        motor = vehicle.front.motor if i < 2 else vehicle.rear.motor
-        electrical, mechanical, brake, drag, _ = _wheel_work(i, state, motion, motors, brakes, drags, motor)
-        power += electrical
-        shaft += mechanical
-        braked += brake
-        dragged += drag
+    front, rear = vehicle.front.motor, vehicle.rear.motor
+    fl = fr = _wheel_work(0, state, motion, motors, brakes, drags, front)
+    rl = rr = _wheel_work(2, state, motion, motors, brakes, drags, rear)
+    alike = _alike(wheels) and _alike(motion.wheel_speed_radps) and _alike(motors) and _alike(brakes)
+    if not (alike and _alike(motion.holding_torque_nm)):
+        fr = _wheel_work(1, state, motion, motors, brakes, drags, front)
+        rr = _wheel_work(3, state, motion, motors, brakes, drags, rear)
+    power = fl.electrical_w + fr.electrical_w + rl.electrical_w + rr.electrical_w
+    shaft = fl.shaft_w + fr.shaft_w + rl.shaft_w + rr.shaft_w
+    braked = fl.braked_w + fr.braked_w + rl.braked_w + rr.braked_w
+    dragged = fl.dragged_w + fr.dragged_w + rl.dragged_w + rr.dragged_w
     pack = pack_after(state.soc, state.polarisation_v, power, h, vehicle.battery)
     mean_speed = motion.mean_speed_mps
     books = state.energies
@@ -396,12 +405,7 @@ def _substep(
         polarisation_v=pack.polarisation_v,
         heat=heat,
         motor_torque_nm=motors,
-        friction_torque_nm=(
-            -_brake_part(-motion.holding_torque_nm[0], brakes[0], drags[0]),
-            -_brake_part(-motion.holding_torque_nm[1], brakes[1], drags[1]),
-            -_brake_part(-motion.holding_torque_nm[2], brakes[2], drags[2]),
-            -_brake_part(-motion.holding_torque_nm[3], brakes[3], drags[3]),
-        ),
+        friction_torque_nm=(-fl.braking_nm, -fr.braking_nm, -rl.braking_nm, -rr.braking_nm),
         electrical_power_w=power,
         current_a=pack.current_a,
         terminal_v=pack.terminal_v,

@@ -2,10 +2,10 @@
 """The step of `model.longitudinal` for a car whose left and right wheels are alike, from a good guess.
 
 Three unknowns are left: the speeds of the car and of a wheel of each axle at the end of the step. Newton's method on
-all three at once takes two or three iterations from the solution of a neighbouring problem, where `longitudinal.step`,
-which has to find its way from anywhere, takes a dozen evaluations of each tyre and more. It answers only where it is
-sure: a wheel or the car that stops, a wheel equation that may have several solutions, or an iteration that does not
-converge are left to `longitudinal.step`.
+all three at once takes two or three iterations from the solution of a neighbouring problem, or from the car's motion
+so far, where `longitudinal.step`, which has to find its way from anywhere, takes a dozen evaluations of each tyre and
+more. It answers only where it is sure: a wheel or the car that stops, a wheel equation that may have several solutions,
+or an iteration that does not converge are left to `longitudinal.step`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import math
 from typing import NamedTuple
 
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.model.chassis import aerodynamic_force_n, normal_forces_n, rolling_force_n
-from iwm_power_manager.model.longitudinal import step
+from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n, rolling_force_n
+from iwm_power_manager.model.longitudinal import Two, step
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.model.tyre import friction_and_slope
 
@@ -44,13 +44,14 @@ class Torques(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """A step: speeds at its end, the force of a tyre of each axle (N), and what brake and drag really exerted (N m)."""
+    """A step: speeds at its end, the force of a tyre of each axle (N), what brake and drag, and rolling, exerted."""
 
     speeds: Speeds
     front_force_n: float
     rear_force_n: float
     front_resisting_nm: float
     rear_resisting_nm: float
+    rolling_force_n: float
 
 
 class Curve(NamedTuple):
@@ -146,44 +147,61 @@ def _only_one(car: float, normal: float, force: float, curve: Curve, rate: float
     return rate + radius * radius * normal * curve.fall / max(car, axle.tyre.slip_speed_floor_mps) > 0.0
 
 
+class _Found(NamedTuple):
+    """What Newton's method came to, if anything, and what tells how sure it is.
+
+    `rising` : no tyre was beyond its peak on the way
+    """
+
+    found: bool
+    rising: bool
+    speeds: Speeds
+    front_n: float
+    rear_n: float
+    front_force_n: float
+    rear_force_n: float
+
+
 @kernel
 def _newton(
     before: Speeds,
     torques: Torques,
     guess: Speeds,
-    friction: float,
-    curves: tuple[Curve, Curve],
+    grade: float,
+    friction: Two,
     dt_s: float,
     vehicle: VehicleParams,
-) -> tuple[bool, Speeds]:
-    """The step on a level road, and whether it was found."""
+) -> _Found:
     chassis = vehicle.chassis
     part = dt_s / chassis.mass_kg
-    rolling = rolling_force_n(0.0, chassis)
+    rolling = rolling_force_n(grade, chassis)
+    slope = grade_force_n(grade, chassis)
     front_rate = vehicle.front.wheel.inertia_kgm2 / dt_s
     rear_rate = vehicle.rear.wheel.inertia_kgm2 / dt_s
     front_nm = torques.front_motor_nm - torques.front_resisting_nm
     rear_nm = torques.rear_motor_nm - torques.rear_resisting_nm
     wheelbase = chassis.front_axle_to_cg_m + chassis.rear_axle_to_cg_m
     car, front, rear = guess
+    rising = True
     for _ in range(_MOST_ITERATIONS):
-        front_n, rear_n = normal_forces_n((car - before.car_mps) / dt_s, car, 0.0, chassis)
+        front_n, rear_n = normal_forces_n((car - before.car_mps) / dt_s, car, grade, chassis)
         both = front_n + rear_n
         drag = aerodynamic_force_n(car, chassis)
         drag_by_car = 2.0 * drag / car
         shift = 0.0
         if 0.0 < front_n < both:
             shift = chassis.cg_height_m * (1.0 / part + drag_by_car) / (2.0 * wheelbase)
-        f = _balance(front, car, before.front_radps, front_nm, front_n, -shift, friction, front_rate, vehicle.front)
-        r = _balance(rear, car, before.rear_radps, rear_nm, rear_n, shift, friction, rear_rate, vehicle.rear)
+        f = _balance(front, car, before.front_radps, front_nm, front_n, -shift, friction[0], front_rate, vehicle.front)
+        r = _balance(rear, car, before.rear_radps, rear_nm, rear_n, shift, friction[1], rear_rate, vehicle.rear)
         if f.by_wheel <= 0.0 or r.by_wheel <= 0.0:
             break
+        rising = rising and f.force_by_wheel > 0.0 and r.force_by_wheel > 0.0
         # Each wheel follows the car as its own equation says; what is left is one equation of the car's speed.
         front_lag = f.force_by_wheel / f.by_wheel
         rear_lag = r.force_by_wheel / r.by_wheel
         force = f.force_n + r.force_n - front_lag * f.missing_nm - rear_lag * r.missing_nm
         force_by_car = f.force_by_car + r.force_by_car - front_lag * f.by_car - rear_lag * r.by_car
-        missing = car - before.car_mps + part * (drag + rolling - 2.0 * force)
+        missing = car - before.car_mps + part * (drag + rolling + slope - 2.0 * force)
         change = -missing / (1.0 + part * (drag_by_car - 2.0 * force_by_car))
         front_change = -(f.missing_nm + f.by_car * change) / f.by_wheel
         rear_change = -(r.missing_nm + r.by_car * change) / r.by_wheel
@@ -197,10 +215,55 @@ def _newton(
             and abs(front_change) <= _SMALL * (1.0 + front)
             and abs(rear_change) <= _SMALL * (1.0 + rear)
         ):
-            sure = _only_one(car, front_n, f.force_n, curves[0], front_rate, vehicle.front)
-            sure = sure and _only_one(car, rear_n, r.force_n, curves[1], rear_rate, vehicle.rear)
-            return sure, Speeds(car, front, rear)
-    return False, guess
+            return _Found(True, rising, Speeds(car, front, rear), front_n, rear_n, f.force_n, r.force_n)
+    return _Found(False, False, guess, 0.0, 0.0, 0.0, 0.0)
+
+
+@kernel
+def _moved(
+    sure: bool,
+    before: Speeds,
+    torques: Torques,
+    after: Speeds,
+    guess: Speeds,
+    grade: float,
+    friction: Two,
+    dt_s: float,
+    vehicle: VehicleParams,
+) -> Moved:
+    """The step to speeds that are sure, or as `longitudinal.step` finds it from a guess."""
+    t = torques
+    if sure:
+        front, rear = vehicle.front.wheel, vehicle.rear.wheel
+        front_gained = front.inertia_kgm2 / dt_s * (after.front_radps - before.front_radps)
+        rear_gained = rear.inertia_kgm2 / dt_s * (after.rear_radps - before.rear_radps)
+        return Moved(
+            after,
+            (t.front_motor_nm - t.front_resisting_nm - front_gained) / front.radius_m,
+            (t.rear_motor_nm - t.rear_resisting_nm - rear_gained) / rear.radius_m,
+            t.front_resisting_nm,
+            t.rear_resisting_nm,
+            rolling_force_n(grade, vehicle.chassis),
+        )
+    motion = step(
+        before.car_mps,
+        (before.front_radps, before.front_radps, before.rear_radps, before.rear_radps),
+        (guess.car_mps - before.car_mps) / dt_s,
+        (t.front_motor_nm, t.front_motor_nm, t.rear_motor_nm, t.rear_motor_nm),
+        (t.front_resisting_nm, t.front_resisting_nm, t.rear_resisting_nm, t.rear_resisting_nm),
+        grade,
+        (friction[0], friction[0], friction[1], friction[1]),
+        dt_s,
+        vehicle,
+    )
+    return Moved(
+        Speeds(motion.speed_mps, motion.wheel_speed_radps[0], motion.wheel_speed_radps[2]),
+        motion.tyre_force_n[0],
+        motion.tyre_force_n[2],
+        motion.resisting_torque_nm[0],
+        motion.resisting_torque_nm[2],
+        motion.rolling_force_n,
+    )
 
 
 @kernel
@@ -221,37 +284,52 @@ def step_from(
     guess : speeds at the end of the step, > 0, as near as may be
     curves : `curve_of` the front and the rear tyre, or `UNSURE`
     """
-    found = curves[0].fall > -math.inf and guess.car_mps > 0.0 and guess.front_radps > 0.0 and guess.rear_radps > 0.0
+    both = (friction, friction)
+    sure = curves[0].fall > -math.inf and guess.car_mps > 0.0 and guess.front_radps > 0.0 and guess.rear_radps > 0.0
     after = guess
-    if found:
-        found, after = _newton(before, torques, guess, friction, curves, dt_s, vehicle)
-    t = torques
-    if found:
-        front, rear = vehicle.front.wheel, vehicle.rear.wheel
-        front_gained = front.inertia_kgm2 / dt_s * (after.front_radps - before.front_radps)
-        rear_gained = rear.inertia_kgm2 / dt_s * (after.rear_radps - before.rear_radps)
-        return Moved(
-            after,
-            (t.front_motor_nm - t.front_resisting_nm - front_gained) / front.radius_m,
-            (t.rear_motor_nm - t.rear_resisting_nm - rear_gained) / rear.radius_m,
-            t.front_resisting_nm,
-            t.rear_resisting_nm,
+    if sure:
+        found = _newton(before, torques, guess, 0.0, both, dt_s, vehicle)
+        after = found.speeds
+        front_rate = vehicle.front.wheel.inertia_kgm2 / dt_s
+        rear_rate = vehicle.rear.wheel.inertia_kgm2 / dt_s
+        car = after.car_mps
+        sure = (
+            found.found
+            and _only_one(car, found.front_n, found.front_force_n, curves[0], front_rate, vehicle.front)
+            and _only_one(car, found.rear_n, found.rear_force_n, curves[1], rear_rate, vehicle.rear)
         )
-    motion = step(
-        before.car_mps,
-        (before.front_radps, before.front_radps, before.rear_radps, before.rear_radps),
-        (guess.car_mps - before.car_mps) / dt_s,
-        (t.front_motor_nm, t.front_motor_nm, t.rear_motor_nm, t.rear_motor_nm),
-        (t.front_resisting_nm, t.front_resisting_nm, t.rear_resisting_nm, t.rear_resisting_nm),
-        0.0,
-        (friction, friction, friction, friction),
-        dt_s,
-        vehicle,
+    return _moved(sure, before, torques, after, guess, 0.0, both, dt_s, vehicle)
+
+
+@kernel
+def step_onward(
+    before: Speeds,
+    torques: Torques,
+    acceleration_mps2: float,
+    grade: float,
+    friction: Two,
+    dt_s: float,
+    vehicle: VehicleParams,
+) -> Moved:
+    """Advance car and wheels by one implicit step, as a car moves on.
+
+    Tyres that are below their peak and stay there have one solution: the one that the motion leads to.
+
+    Parameters
+    ----------
+    before : >= 0
+    acceleration_mps2 : of the previous step; only a first guess
+    grade : rise over run
+    friction : peak friction coefficient under the front and the rear wheels
+    """
+    gained = acceleration_mps2 * dt_s
+    guess = Speeds(
+        before.car_mps + gained,
+        before.front_radps + gained / vehicle.front.wheel.radius_m,
+        before.rear_radps + gained / vehicle.rear.wheel.radius_m,
     )
-    return Moved(
-        Speeds(motion.speed_mps, motion.wheel_speed_radps[0], motion.wheel_speed_radps[2]),
-        motion.tyre_force_n[0],
-        motion.tyre_force_n[2],
-        motion.resisting_torque_nm[0],
-        motion.resisting_torque_nm[2],
-    )
+    if guess.car_mps > 0.0 and guess.front_radps > 0.0 and guess.rear_radps > 0.0:
+        found = _newton(before, torques, guess, grade, friction, dt_s, vehicle)
+        if found.found and found.rising:
+            return _moved(True, before, torques, found.speeds, guess, grade, friction, dt_s, vehicle)
+    return _moved(False, before, torques, guess, guess, grade, friction, dt_s, vehicle)

@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n
 from iwm_power_manager.model.longitudinal import step
-from iwm_power_manager.model.two_axles import UNSURE, Speeds, Torques, curve_of, step_from
+from iwm_power_manager.model.two_axles import UNSURE, Speeds, Torques, curve_of, step_from, step_onward
+from iwm_power_manager.model.tyre import friction_coefficient, peak_slip, slip_ratio
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 
@@ -62,6 +64,38 @@ def test_from_any_guess_the_motion_is_that_of_the_general_step(speed, slips, mot
         force = (moved.front_force_n, moved.rear_force_n)[i]
         turned = axle.wheel.inertia_kgm2 / dt_s * (moved.speeds[1 + i] - before[1 + i])
         assert motors[i] - held - axle.wheel.radius_m * force == pytest.approx(turned, abs=1e-6)
+
+
+@settings(max_examples=400)
+@given(
+    speed=st.floats(0.0, 40.0),
+    slips=st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1)),
+    motors=st.tuples(st.floats(-80.0, 200.0), st.floats(-80.0, 200.0)),
+    brakes=st.tuples(st.floats(0.0, 300.0), st.floats(0.0, 300.0)),
+    grade=st.sampled_from([-0.15, 0.0, 0.05]),
+    friction=st.tuples(st.sampled_from([0.3, 0.9]), st.sampled_from([0.4, 0.8])),
+    car=st.sampled_from([CAR, FIALA]),
+)
+def test_onward_the_motion_is_that_of_the_general_step_or_the_one_without_a_jump_to_sliding(
+    speed, slips, motors, brakes, grade, friction, car
+):
+    before = Speeds(speed, speed * (1.0 + slips[0]) / 0.33, speed * (1.0 + slips[1]) / 0.33)
+    moved = step_onward(before, Torques(*motors, *brakes), 0.5, grade, friction, 0.01, car)
+    pairs = [(value, value) for value in (*before[1:], *motors, *brakes, *friction)]
+    wheels, motor, brake, mu = (pairs[i] + pairs[i + 1] for i in (0, 2, 4, 6))
+    general = step(speed, wheels, 0.5, motor, brake, grade, mu, 0.01, car)
+    wanted = (general.speed_mps, *general.wheel_speed_radps[::2])
+    # What acts on the car is what accelerates it (eq. 1), and each tyre's force is that of its slip (eq. 6, 9).
+    air, slope = aerodynamic_force_n(moved.speeds.car_mps, car.chassis), grade_force_n(grade, car.chassis)
+    force = 2.0 * (moved.front_force_n + moved.rear_force_n) - air - slope - moved.rolling_force_n
+    assert moved.speeds.car_mps - speed == pytest.approx(force * 0.01 / car.chassis.mass_kg, abs=1e-8)
+    loads = normal_forces_n((moved.speeds.car_mps - speed) / 0.01, moved.speeds.car_mps, grade, car.chassis)
+    for i, axle in enumerate((car.front, car.rear)):
+        slip = slip_ratio(moved.speeds[1 + i], moved.speeds.car_mps, 0.33, axle.tyre.slip_speed_floor_mps)
+        wanted_n = loads[i] * friction_coefficient(slip, friction[i], axle.tyre)
+        assert (moved.front_force_n, moved.rear_force_n)[i] == pytest.approx(wanted_n, abs=0.01)
+        if tuple(moved.speeds) != pytest.approx(wanted, rel=1e-6, abs=1e-6):
+            assert abs(slip) < peak_slip(axle.tyre, friction[i])
 
 
 def test_without_a_curve_it_is_the_general_step_bit_by_bit():
