@@ -85,8 +85,8 @@ def _program(study: Study) -> str:
     ahead = by.get("look-ahead")
     alone = ahead.saving_percent[place] if ahead else None
     text = (
-        f"As printed, on its grid ({labels.PAPER_SDP}), it saves in {gains} of {len(found)} cells: "
-        f"{min(found):.2f} to {max(found):.2f} %."
+        f"As printed, on its grid ({labels.PAPER_SDP}), it saves in {gains} of {len(found)} cells "
+        f"({min(found):.2f} to {max(found):.2f} %)."
     )
     if ahead and alone is not None:
         text += (

@@ -202,7 +202,7 @@ def frontier(base: Case, priced: Mapping[float, str]) -> list[Case]:
         for cost in FRONTIER_COSTS_J
     ]
     ours = [
-        replace(base, strategy=STRATEGY, label=f"ours|{price:g} J", policy=policy) for price, policy in priced.items()
+        replace(base, strategy=STRATEGY, label=f"ours|{price:.3g} J", policy=policy) for price, policy in priced.items()
     ]
     return [replace(base, label="ED|"), *rival, *bound, *ours]
 

@@ -212,16 +212,15 @@ def cell_by_cell(study: Study) -> TableOf:
         group = f"{idle_drive}:"
         for label, text in ((PAPER_SDP, "paper's problem"), (OURS, "ours")):
             columns.append(Column(text, _of(idle_drive, _saving(label)), "%", 2, group=group))
-        columns.append(Column("most of any strategy", _of(idle_drive, most_saved), "%", 2, group=group))
+        columns.append(Column("best of all", _of(idle_drive, most_saved), "%", 2, group=group))
     columns.append(Column("The printed saving", lambda row: verdict(_printed("saving")(row.none), row.none, row.drag)))
     return TableOf(
         "Cell by cell",
         "",
         columns,
         rows,
-        "Savings against equal split, each for idle drive none and drag. Most of any strategy: the highest saving in "
-        "this place among all that were driven, those that know the whole cycle included, however often they change "
-        "the split.",
+        "Savings against equal split, each for idle drive none and drag. Best of all: the highest saving of all "
+        "strategies driven there, those that know the whole cycle included, however often they change the split.",
     )
 
 
@@ -337,8 +336,8 @@ def rivals(study: Study) -> Iterator[TableOf]:
             "power shown. Preview knows the whole cycle; it has our budget of changes (called possible elsewhere), or "
             "changes that cost it nothing. The latter plans on a demand in which changes take no time; driven, each "
             "takes 0.05 s and moves the driver's demand, so that many small ones can save less than few. Ours of "
-            "possible: as part of the most that preview or another strategy saves within our budget. Changes: those by "
-            "more than 0.25; moved is the sum of all, 1 being all the power; blind is instantaneous.",
+            "possible: our saving as a part of the most that preview or another strategy saves within our budget. "
+            "Changes: those by more than 0.25; moved is the sum of all, 1 being all the power; blind is instantaneous.",
         )
 
 

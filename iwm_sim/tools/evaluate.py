@@ -52,7 +52,7 @@ examples:
   The battery's resistance as the paper estimates it (eq. 25), with the comparison plot:
     evaluate --fit-battery --plot battery.svg
 
-  Every table and figure of the paper, and what beats them (half an hour on two cores):
+  Every table and figure of the paper, and what beats them (10 min on two cores):
     evaluate --study runs/study
 
 Vehicles, cycles and grids that come with the package are found by name. Results go to stdout, progress to stderr. An
