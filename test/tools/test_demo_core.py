@@ -20,7 +20,8 @@ from iwm_sim.closed_loop import COLUMNS, Run
 from iwm_sim.drive_bag import DriveBag, problems, with_decisions
 from iwm_sim.metrics import Metrics
 from iwm_sim.plant import initial_plant
-from iwm_sim.study.drive_page import Driven, DriveRow, row
+from iwm_sim.study.drive_page import Driven, DriveRow, drive_page, row
+from iwm_sim.study.report import Chart
 from iwm_sim.tools import demo
 
 
@@ -197,6 +198,19 @@ def test_the_table_lines_up_and_shows_what_is_missing():
     assert "LOST" in lines[3]
     assert "–" in lines[3]
     assert lines[4].index("1.23") + 4 == lines[3].index("–") + 1
+
+
+def test_the_split_is_not_drawn_while_the_car_stands():
+    run = run_of(speed_mps=np.repeat((5.0, 0.0), 50), front_share=0.65)
+    driven = Driven(
+        "equal", "in one process", run, metrics.measure(run, load_vehicle(resolve("jalalmaab_2015")).params)
+    )
+    page = drive_page(driven, driven, cycle="c", idle_drive="drag", critical_slip=0.2, settings={}, remarks=())
+    (chart,) = (block for block in page.blocks if isinstance(block, Chart))
+    (panel,) = (panel for panel in chart.panels if panel.label == "Front share")
+    for series in panel.series:
+        assert np.isfinite(series.values[:50]).all()
+        assert np.isnan(series.values[50:]).all()
 
 
 def test_rows_of_a_car_that_never_moved_are_still_json():
