@@ -22,8 +22,9 @@ MIN_ACCELERATION_MPS2 = 0.02
 _MIN_SAMPLES, _MIN_SPEED_RANGE_MPS = 10, 3.0
 _WINDOW_S, _SHORTEST_S = 1.0, 1e-3
 #: A drive is livelier than driving on roads is where the 95th percentile of speed times acceleration, over the seconds
-#: with more than 0.1 m/s2, exceeds these W/kg by mean speed: Regulation (EU) 2017/1151, annex IIIA, appendix 7a, 4.1.1
-#: (such a drive is no valid test of emissions). Cycles and drives are at 0.3 to 1.0 of it, in km/h at 2.6 and more.
+#: with more than 0.1 m/s2, exceeds these W/kg by mean speed: Regulation (EU) 2017/1151, annex IIIA, appendix 7a, 4.1.1,
+#: 0.136 v + 14.44 to 74.6 km/h and 0.0742 v + 18.966 above (there for the urban, rural and motorway part each; such a
+#: drive is no valid test of emissions). Cycles and drives are at 0.3 to 1.0 of it, in km/h at 2.6 and more.
 _LIVELY_MPS2, _LIVELY_FROM_KMH = 0.1, 74.6
 _LIVELY_BELOW, _LIVELY_ABOVE = (14.44, 0.136), (18.966, 0.0742)
 _TOO_LIVELY, _LIVELIEST = 1.7, 1.2

@@ -689,9 +689,9 @@ def _hold_nm(
 
 
 @kernel
-def _held(friction_nm: float, hold_nm: float, gated: bool, axle: Axle) -> float:
-    """Friction torque with what the hold adds."""
-    return friction_nm if gated else max(min(friction_nm, -hold_nm), -axle.friction_brake.max_torque_nm)
+def _held_nm(hold_nm: float, gated: bool, axle: Axle) -> float:
+    """Friction torque that holds a wheel; nobody brakes meanwhile, so there is no other."""
+    return 0.0 if gated else -min(hold_nm, axle.friction_brake.max_torque_nm)
 
 
 @kernel
@@ -808,14 +808,17 @@ def step(
     e, f, g, h = after.wheels
     motor = made.motor_torque_nm
     friction = made.friction_torque_nm
-    motor_before = before.wheels[0].motor_nm + before.wheels[2].motor_nm
-    hold = _hold_nm(state.hold_nm, motion, m, motor[0] + motor[2], motor_before, vehicle)
+    a, b, c, d = before.wheels
+    # Of a front and a rear wheel, as the mean of both sides.
+    motor_before = 0.5 * (a.motor_nm + b.motor_nm + c.motor_nm + d.motor_nm)
+    motor_now = 0.5 * (motor[0] + motor[1] + motor[2] + motor[3])
+    hold = _hold_nm(state.hold_nm, motion, m, motor_now, motor_before, vehicle)
     if hold > 0.0 and demand >= 0.0:
         friction = (
-            _held(friction[0], hold, e.gated, vehicle.front),
-            _held(friction[1], hold, f.gated, vehicle.front),
-            _held(friction[2], hold, g.gated, vehicle.rear),
-            _held(friction[3], hold, h.gated, vehicle.rear),
+            _held_nm(hold, e.gated, vehicle.front),
+            _held_nm(hold, f.gated, vehicle.front),
+            _held_nm(hold, g.gated, vehicle.rear),
+            _held_nm(hold, h.gated, vehicle.rear),
         )
     final = ControllerState(
         steps=after.steps,

@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 from iwm_power_manager.control import law
 from iwm_power_manager.control.settings import GATE_MODE_OFF, default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import ControllerState, Measurement, initial_state
+from iwm_power_manager.control.types import (
+    LIMIT_FRICTION_BRAKE,
+    LIMIT_SLEW,
+    LIMIT_SLIP,
+    ControllerState,
+    Measurement,
+    initial_state,
+)
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 
@@ -177,6 +184,66 @@ def test_each_axle_has_its_own_brakes_motors_and_radius():
     command, _ = step(measured(100e3), remembered(motor_nm=(150.0, 150.0, 150.0, 150.0)), OFF)
     given_w = [torque * wheel for torque, wheel in zip(command.motor_torque_nm, rolling(), strict=True)]
     assert given_w == pytest.approx([CAR.front.motor.max_power_w] * 2 + [CAR.rear.motor.max_power_w] * 2)
+
+
+@WHEELS
+def test_what_keeps_one_wheel_from_its_part_is_said_of_that_wheel(wheel):
+    # It skids a little and its neighbour takes what it leaves: grip is its limit, and nothing is the neighbour's.
+    wheels = one(wheel, 0.83 * rolling()[wheel], rolling())
+    weak = CAR.rear.friction_brake._replace(max_torque_nm=100.0)
+    car = CAR._replace(**{name: getattr(CAR, name)._replace(friction_brake=weak) for name in ("front", "rear")})
+    command, after = law.step(measured(-4e3, wheels), remembered(speed_radps=wheels), LIMITER, car, TABLE)
+    assert abs(after.wheels[wheel].total_nm) < abs(after.wheels[wheel ^ 1].total_nm) - 1.0
+    assert command.limits & LIMIT_SLIP
+    assert not command.limits & LIMIT_FRICTION_BRAKE
+
+
+@WHEELS
+def test_a_motor_on_its_way_is_said_whichever_it_is(wheel):
+    tuned = OFF._replace(slew_up_nmps=100.0)
+    there, _ = step(measured(6e3), remembered(motor_nm=(100.0,) * 4), tuned)
+    assert not there.limits & LIMIT_SLEW
+    behind = one(wheel, there.motor_torque_nm[wheel] - 20.0, there.motor_torque_nm)
+    command, _ = step(measured(6e3), remembered(motor_nm=behind), tuned)
+    assert command.limits & LIMIT_SLEW
+
+
+def held(car, before, demand=1500.0, gain=(1.0,) * 4):
+    """The next step of a car at rest that is held on a slope."""
+    state = remembered(0.0, motor_nm=before)._replace(hold_nm=150.0)
+    return law.step(measured(demand, speed=0.0, gain=gain), state, OFF, car, TABLE)[0]
+
+
+@pytest.mark.parametrize("weak", ["front", "rear"])
+def test_each_axle_is_held_by_its_own_brakes(weak):
+    axle = getattr(CAR, weak)
+    car = CAR._replace(**{weak: axle._replace(friction_brake=axle.friction_brake._replace(max_torque_nm=40.0))})
+    both = (-150.0, -150.0)
+    few = (-40.0, -40.0)
+    command = held(car, (0.0,) * 4, demand=0.0)
+    assert command.friction_torque_nm == (few + both if weak == "front" else both + few)
+
+
+@WHEELS
+def test_the_hold_waits_for_each_motor_to_come_to_what_is_asked_for(wheel):
+    gain = one(wheel, 0.0, (1.0,) * 4)
+    steady = (0.0,) * 4
+    for _ in range(50):
+        command = held(CAR, steady, gain=gain)
+        steady = command.motor_torque_nm
+    assert steady[wheel] == 0.0 < steady[wheel ^ 1]
+    assert command.hold_nm < 150.0
+    steady = held(CAR, (60.0,) * 4).motor_torque_nm
+    assert held(CAR, one(wheel, steady[wheel] - 4.0, steady)).hold_nm == 150.0
+
+
+@WHEELS
+def test_a_wheel_that_spins_is_not_held(wheel):
+    back = remembered(-1.0)
+    spinning = one(wheel, 2.0 / RADII[wheel], rolling(-1.0))
+    command, _ = step(measured(1500.0, spinning, speed=-1.0), back, LIMITER._replace(gate_driving=True))
+    assert command.hold_nm > 0.0
+    assert [torque == 0.0 for torque in command.friction_torque_nm] == [i == wheel for i in range(4)]
 
 
 def mirrored(values):
