@@ -175,12 +175,14 @@ class BagWriter:
     def write_all(self, samples: Iterator[Sample]) -> None:
         """Write messages. After `MessageTooLarge` the iterator stands behind the one that was refused."""
         watched = self._splits or self._file_start_ns is None
+        add, channels, pieces, largest = self._add, self._channels, self._pieces, self._largest
         for topic, log_time_ns, data, publish_time_ns, sequence in samples:
-            if watched or len(data) > self._largest:
+            if watched or len(data) > largest:
                 self._prepare(topic, log_time_ns, len(data))
                 watched = self._splits
-            self._add(self._channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
-            if self._pieces:  # a chunk is full
+                add, channels, pieces = self._add, self._channels, self._pieces
+            add(channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
+            if pieces:  # a chunk is full
                 with self._failing():
                     self._open.push()
 
