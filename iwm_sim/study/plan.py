@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -58,24 +57,33 @@ class Policies:
     ----------
     vehicle, policy : car, and folder or file of our policies for it
     say : told, in one line, of everything that is solved
+
+    `used` holds what was asked for, by name, idle drive and friction.
     """
 
     def __init__(self, vehicle: str, policy: str, say: Callable[[str], None] = lambda _: None) -> None:
         self.vehicle = vehicle
         self._source = PolicySource(policy, say=say)
         self._say = say
-        self.ours = functools.cache(self._ours)
-        self.of_variant = functools.cache(self._of_variant)
+        self.used: dict[tuple[str, str, float], str] = {}
 
     def car(self, idle_drive: str) -> Vehicle:
         """The car with an idle drive."""
         return cases.vehicle_of(self.vehicle, idle_drive)
 
-    def _ours(self, idle_drive: str, friction: float) -> str:
-        return self._source.find(self.car(idle_drive), friction)
+    def ours(self, idle_drive: str, friction: float) -> str:
+        """Our policy for a road."""
+        key = (labels.OURS, idle_drive, friction)
+        if key not in self.used:
+            self.used[key] = self._source.find(self.car(idle_drive), friction)
+        return self.used[key]
 
-    def _of_variant(self, name: str, idle_drive: str, friction: float) -> str:
-        return solved(self.car(idle_drive), friction, VARIANTS[name].grid, self._say)
+    def of_variant(self, name: str, idle_drive: str, friction: float) -> str:
+        """The policy of a name in `VARIANTS` for a road."""
+        key = (name, idle_drive, friction)
+        if key not in self.used:
+            self.used[key] = solved(self.car(idle_drive), friction, VARIANTS[name].grid, self._say)
+        return self.used[key]
 
     def priced(self, folder: Path) -> dict[float, str]:
         """Our policy solved for other prices of a change, by price in J; the problems go to a folder."""

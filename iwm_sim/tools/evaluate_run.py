@@ -35,7 +35,7 @@ from iwm_sim.study import (
 )
 from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result, SensorNoise
 from iwm_sim.study.driving import Progress, drive_all, on_all_cores, silent, tell, warm_up, with_rules
-from iwm_sim.study.names import REFERENCE, TABLES
+from iwm_sim.study.names import REFERENCE
 from iwm_sim.study.plan import Policies
 from iwm_sim.study.policies import PolicySource
 from iwm_sim.study.rows import Row, rows_of
@@ -226,23 +226,19 @@ def _paper(options: argparse.Namespace) -> None:
     if not options.quiet:
         for table in tables:
             print(f"{table.title or table.section}\n{plain_table(table.rows, table.columns)}\n")
-        print(f"{table.note}\n{_policies_text(policies, options.paper, idle_drives)}")
+        print(f"{table.note}\n{_policies_text(policies)}")
     if options.json:
         rows = [row.to_json() for table in tables for cell in table.rows for row in cell.values()]
         write_json(options.json, {"package_version": __version__, "table": options.paper, "rows": rows})
 
 
-def _policies_text(policies: Policies, table: str, idle_drives: Sequence[str]) -> str:
-    """Which policies a table was driven with."""
+def _policies_text(policies: Policies) -> str:
+    """Which policies a result was made with."""
     lines = ["control at 100 Hz; ours decides every 0.02 s, the paper's every 0.1 s; policies:"]
-    names = ("paper_sdp_ungated", "paper_sdp_table2") if table == "6" else ("paper_sdp",)
-    for friction in TABLES[table]:
-        for idle_drive in idle_drives:
-            used = {"ours": policies.ours(idle_drive, friction)}
-            used |= {name: policies.of_variant(name, idle_drive, friction) for name in names}
-            found = {name: cases.policy_of(path) for name, path in used.items()}
-            text = ", ".join(f"{name}: {policy.problem.name} {policy.checksum[:8]}" for name, policy in found.items())
-            lines.append(f"  friction {friction:g}, idle drive {idle_drive}: {text}")
+    for (name, idle_drive, friction), path in policies.used.items():
+        policy = cases.policy_of(path)
+        identity = f"{policy.problem.name} {policy.checksum[:8]}"
+        lines.append(f"  {name}, idle drive {idle_drive}, friction {friction:g}: {identity}")
     return "\n".join(lines)
 
 
@@ -254,29 +250,33 @@ def _figure(options: argparse.Namespace) -> None:
     write_picture(options.plot, drawn.captioned())
     if not options.quiet:
         print(f"{drawn.title}. {drawn.note}\npicture: {options.plot}")
+        if policies.used:
+            print(_policies_text(policies))
 
 
 def _ablation(options: argparse.Namespace) -> None:
     say = silent if options.quiet else tell
+    policies = Policies(options.vehicle, options.policy, say)
     with tempfile.TemporaryDirectory(prefix="iwm-ablation-") as folder:
-        rows = ablation.ablation(Policies(options.vehicle, options.policy, say), Path(folder), options.jobs, say)
+        rows = ablation.ablation(policies, Path(folder), options.jobs, say)
     if not options.quiet:
-        print(f"{plain_table(rows, ablation.columns(rows))}\n{ABLATION_NOTE}")
+        print(f"{plain_table(rows, ablation.columns(rows))}\n{ABLATION_NOTE}\n{_policies_text(policies)}")
     if options.json:
         content = {"package_version": __version__, "rows": [dataclasses.asdict(row) for row in rows]}
         write_json(options.json, content)
 
 
 def _fit_battery(options: argparse.Namespace) -> None:
+    friction = (options.friction or [0.9])[0]
     fit = battery_fit.fit(
         options.vehicle,
         (options.idle_drive or [""])[0],
         options.cycle or battery_fit.CYCLES,
-        (options.friction or [0.9])[0],
+        friction,
         options.initial_soc,
     )
     if not options.quiet:
-        print(fit.text())
+        print(f"{fit.text()}\nequal split, friction {friction:g}, idle drive {fit.idle_drive}, control at 100 Hz")
     if options.plot:
         write_picture(options.plot, battery_figure(fit).captioned())
         tell(f"picture: {options.plot}")
@@ -297,7 +297,9 @@ def _scenario(options: argparse.Namespace) -> None:
         for strategy in strategies:
             result = check_scenario(scenario, law_settings.default_settings(strategy))
             if not options.quiet:
-                print(f"{strategy}\n{road_text(result)}", flush=True)
+                car, law = scenario.vehicle, law_settings.default_settings(strategy)
+                how = f"control at 100 Hz, decided every {law.decision_period_s:g} s, policies of the folder policies"
+                print(f"{strategy}, {car.name}, idle drive {car.idle_drive}, {how}\n{road_text(result)}", flush=True)
             made = {"scenario": scenario.name, "strategy": strategy, "passed": result.passed}
             rows.append(made | {"values": result.values})
     if options.json:
