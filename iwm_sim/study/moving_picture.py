@@ -64,11 +64,12 @@ def animate(run: Run, path: Path, title: str) -> None:
     if path.suffix != ".gif":
         raise ConfigError(path, "", "cannot hold a moving picture", "a file that ends with .gif")
     part_s = _liveliest(run)
-    times = np.arange(*part_s, TIMES_FASTER / FRAMES_PER_S)
+    steps = np.searchsorted(run["time_s"], np.arange(*part_s, TIMES_FASTER / FRAMES_PER_S))
     scene = _scene(run, title, part_s)
-    frames = [_frame(scene, run, int(at)) for at in np.searchsorted(run["time_s"], times)]
-    # One palette for all: what does not move is the same bytes in every frame, and is stored once.
-    palette = frames[len(frames) // 2].quantize(_PALETTE, dither=Image.Dither.NONE)
+    frames = [_frame(scene, run, int(at)) for at in steps]
+    # One palette for all: what does not move is the same bytes in every frame, and is stored once. It is that of the
+    # frame with most regeneration, whose green no other colour has.
+    palette = frames[int(np.argmin(run["front_motor_nm"][steps]))].quantize(_PALETTE, dither=Image.Dither.NONE)
     first, *others = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     stored = io.BytesIO()
     first.save(stored, "GIF", save_all=True, append_images=others, duration=1000 // FRAMES_PER_S, loop=0)
