@@ -38,7 +38,7 @@ from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.run import Replay, ReplayOutput
 from iwm_power_manager.signals.contract import WHEEL_NAMES
-from iwm_power_manager.signals.mapping import JOINT_STATE, load_mapping
+from iwm_power_manager.signals.mapping import JOINT_STATE
 from iwm_power_manager.signals.readings import joint_state_writer
 from iwm_power_manager.signals.types import definition_of, standard_types
 
@@ -196,14 +196,13 @@ def _foxglove_sdk(path: Path, definition: str, count: int) -> int:
 def _read(folder: Path, steps: int) -> dict[str, float]:
     inputs, drive = folder / "inputs", folder / "drive"
     _write_inputs(inputs, steps)
-    mapping = load_mapping()
     choice = Choice(strategy="instantaneous_slip")
 
     def replay(path: Path, output: Path | None, wanted: Choice, reader: type[BagReader] = BagReader) -> int:
         count = 0
         with reader(path) as bag:
             plan = make_plan(wanted, bag.custom_data)
-            run = Replay(bag, plan, mapping)
+            run = Replay(bag, plan)
             writer = BagWriter(output, WriterOptions(), bag.custom_data) if output else None
             sink = ReplayOutput(writer, bag, plan) if writer else None
             for message, made in run.steps():

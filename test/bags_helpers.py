@@ -20,9 +20,13 @@ from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.thresholds import RECORDED, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.policy import choose, load_policy_bank
-from iwm_power_manager.replay.run import COMPUTED
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.contract import WHEEL_NAMES
+from iwm_power_manager.signals.contract import (
+    FRICTION_BRAKE_COMMAND,
+    POWER_MANAGER_STATE,
+    WHEEL_NAMES,
+    WHEEL_TORQUE_COMMAND,
+)
 from iwm_power_manager.signals.mapping import JOINT_STATE
 from iwm_power_manager.signals.readings import joint_state_writer
 from iwm_power_manager.signals.types import definition_of, standard_types
@@ -98,7 +102,8 @@ class ScriptedDrive:
             wheel_topic = bag.add_topic(topic("/wheel_states", JOINT_STATE))
             battery_topic = bag.add_topic(topic("/battery_state", BATTERY))
             demand_topic = bag.add_topic(topic("/power_demand"))
-            outputs = [bag.add_topic(topic(f"/{name}", JOINT_STATE)) for name in COMPUTED] if commands or state else []
+            names = (WHEEL_TORQUE_COMMAND, FRICTION_BRAKE_COMMAND, POWER_MANAGER_STATE)
+            outputs = [bag.add_topic(topic(f"/{name}", JOINT_STATE)) for name in names] if commands or state else []
             for i in range(start, start + count):
                 now = (i + 1) * self.DT_NS
                 speed, wheels, demand = self.inputs(i)

@@ -8,8 +8,9 @@ The order, which is also the order of precedence from weak to strong:
 1. slip of each wheel, filtered (eq. 10), and the torque the road took from it (eq. 11);
 2. split: the strategy decides the front share, many times a second; the applied share follows at a limited rate;
 3. skid gate: a wheel beyond the critical slip (Table 2 as printed: its axle) gets nothing, the others what they can;
-4. capacity: what motors (peak, heat, power; eq. 19, 40), brakes, the slip limiter and the axle's yaw budget let each
-   wheel give; what does not fit on one goes to the axle's other wheel and to the other axle (eq. 12);
+4. capacity: what motors (peak, heat, power; eq. 19, 40), brakes (regeneration, where there are none), the slip limiter
+   and the axle's yaw budget let each wheel give; what does not fit on one goes to the axle's other wheel and to the
+   other axle (eq. 12);
 5. power becomes torque (eq. 16-18); regeneration up to its limit, friction the rest (eq. 20, 41, 42);
 6. slew limits on the motors; while a regenerative torque grows, friction fills in, so that braking always gets through;
 7. battery limits on the motors (eq. 24, 43); friction takes over what cannot be regenerated.
@@ -209,7 +210,9 @@ def _wheel(
         road_nm=road,
         slip=slip,
         gated=gated,
-        actuator_nm=axle.friction_brake.max_torque_nm
+        actuator_nm=max(
+            axle.friction_brake.max_torque_nm, gain * regeneration_limit_nm(fast, speed_mps, before.heat, axle.motor)
+        )
         if braking
         else gain * torque_limit_nm(fast, before.heat, axle.motor),
         gain=gain,
@@ -297,7 +300,7 @@ def _limits(wheel: Wheel, given: Given, short: bool, braking: bool, axle: Axle) 
         if wheel.grip_nm < wheel.actuator_nm:
             bits |= LIMIT_SLIP
         elif braking:
-            bits |= LIMIT_FRICTION_BRAKE
+            bits |= LIMIT_FRICTION_BRAKE if axle.friction_brake.max_torque_nm > 0.0 else LIMIT_REGENERATION
         else:
             bits |= LIMIT_MOTOR
             if wheel.actuator_nm < torque_limit_nm(wheel.fast_radps, 0.0, axle.motor):

@@ -65,6 +65,10 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
     started_s = time.monotonic()
     vehicle = load_vehicle(resolve(values["vehicle_file"]), values["idle_drive"] or None)
     policies = choose_policies(values["policy_file"], values["strategy"], values["fallback"], values["rule"], vehicle)
+    names = tuple(values["wheel_names"])
+    mapping = load_mapping(resolve(values["signals_file"]))
+    if values["signals_file"] == DEFAULT_MAPPING:
+        mapping = mapping.with_wheel_names(names)
     thresholds = config.thresholds_of(values)
     limits = ControllerLimits(
         input_limits(thresholds, vehicle.params.front.wheel.radius_m, by_clock=not values["lockstep"]),
@@ -72,15 +76,11 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
         supervision_limits(thresholds),
         actuator_limits(thresholds),
     )
-    names = tuple(values["wheel_names"])
     settings = config.law_settings(values, policies.strategy)
     estimated = values["friction_source"] == config.ESTIMATED
     friction = settings.friction_prior if estimated else values["friction"]
     table = policies.table(friction)
-    controller = Controller(vehicle.params, names, limits, settings, table, friction)
-    mapping = load_mapping(resolve(values["signals_file"]))
-    if values["signals_file"] == DEFAULT_MAPPING:
-        mapping = mapping.with_wheel_names(names)
+    controller = Controller(mapping.car(vehicle.params), names, limits, settings, table, friction)
     readers, commands = _interface(mapping, controller, vehicle, values)
     # The first call compiles the law or reads it from the cache: seconds that no control step may take.
     for warmed in policies.tables():

@@ -43,35 +43,24 @@ from iwm_power_manager.ros.arguments import EXIT_CODES, check_parameter_files, p
 from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.messages import (
     CLOCK,
-    FRICTION_BRAKE_COMMAND,
     NODE_FRICTION,
     NODE_STATE,
-    POWER_DEMAND,
     POWER_MANAGER_STATE,
     RECORDER_READY,
     TOPIC_TYPES,
-    VEHICLE_SPEED,
-    WHEEL_STATES,
-    WHEEL_TORQUE_COMMAND,
     ns_to_stamp,
 )
 from iwm_power_manager.ros.parameters import Change, ParameterError, Spec, declare
 from iwm_power_manager.ros.raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET, RawSubscriptions, Taken
 from iwm_power_manager.ros.remote_parameters import RemoteParameters
 from iwm_power_manager.share import resolve
+from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, DEMANDS, PEDALS, load_mapping
 from iwm_power_manager.signals.types import definition_of
 
 DIAGNOSTICS = "/diagnostics"
 DEFAULT_TOPICS = [topic for topic in TOPIC_TYPES if topic not in (NODE_FRICTION, NODE_STATE, RECORDER_READY)]
-#: What a closed loop cannot run without: `~/ready` waits for these.
-DEFAULT_WAIT_FOR = [
-    VEHICLE_SPEED,
-    WHEEL_STATES,
-    POWER_DEMAND,
-    WHEEL_TORQUE_COMMAND,
-    FRICTION_BRAKE_COMMAND,
-    POWER_MANAGER_STATE,
-]
+#: Signals a closed loop cannot run without: `~/ready` waits for their topics.
+_LOOP = ("speed", "wheel_speed", *DEMANDS, *PEDALS)
 
 _MEBIBYTE = 1024 * 1024
 _STATUS_PERIOD_S = 1.0
@@ -94,7 +83,13 @@ PARAMETERS = (
     _spec("output", "", "Folder of the bag to create; empty: rosbag2_<date and time> in the working directory."),
     _spec("topics", DEFAULT_TOPICS, "Topics to record; relative names honour namespace and remaps."),
     _spec("regex", "", "Regular expression; every topic whose full name matches it is recorded, too."),
-    _spec("wait_for", DEFAULT_WAIT_FOR, "Topics that must be matched before ~/ready says true."),
+    _spec("signals_file", DEFAULT_MAPPING, "Signals YAML of the car: every topic it names is recorded, too."),
+    _spec(
+        "wait_for",
+        [""],
+        "Topics that must be matched before ~/ready says true; '': those of speed, wheels, demand and commands in the "
+        "signals file, and power_manager/state.",
+    ),
     _spec("record", True, "Begin to record at once; false: wait for ~/start."),
     _spec("compression", "zstd", "Compression of the chunks.", choices=COMPRESSIONS),
     _spec("chunk_bytes", 786_432, "Uncompressed size at which a chunk is written, bytes.", 1024, 64 * _MEBIBYTE),
@@ -129,7 +124,11 @@ class Recorder(Node):
         super().__init__("recorder")
         self._leave_clock_to_the_recording()
         values = declare(self, PARAMETERS)
-        self._wait_for = [self.resolve_topic_name(name) for name in values["wait_for"] if name]
+        mapping = load_mapping(resolve(values["signals_file"]))
+        commands = [sink.topic for sinks in mapping.commands.values() for sink in sinks]
+        sources = [source.topic for signal in _LOOP for source in mapping.sources.get(signal, ())]
+        wait_for = list(filter(None, values["wait_for"])) or [*sources, *commands, POWER_MANAGER_STATE]
+        self._wait_for = [self.resolve_topic_name(name) for name in wait_for]
         self._poll_s = values["poll_period_s"]
         self._exit_on_error = values["exit_on_error"]
         self._remote_parameters = RemoteParameters(self) if values["node_parameters"] else None
@@ -138,7 +137,7 @@ class Recorder(Node):
         self._held: list[Taken] = []
         self._raw = RawSubscriptions(
             self,
-            [self.resolve_topic_name(name) for name in values["topics"] if name],
+            [self.resolve_topic_name(name) for name in (*values["topics"], *mapping.topics(), *commands) if name],
             _pattern(values["regex"]),
             values["depth"],
             _learn,
@@ -388,6 +387,8 @@ _EXAMPLES = f"""\
 examples:
   The power manager's topics, into the folder drive_01:
     recorder --ros-args -p output:=drive_01
+  Those of a car that has other topics, and the power manager's:
+    recorder --ros-args -p output:=drive_01 -p signals_file:=my_signals.yaml
   Two more of the car's own topics, in a new file every ten minutes:
     recorder --ros-args -p output:=drive_01 -p regex:='/imu|/gps/.*' -p max_duration_s:=600.0
   What a power cut left:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -15,7 +16,8 @@ from iwm_power_manager.control.types import WHEEL_NAMES
 from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.policy import Policy, choose, load_policy_bank
-from iwm_power_manager.share import resolve, roots
+from iwm_power_manager.share import resolve, roots, share_path
+from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, SignalMapping, load_mapping
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
 DEFAULT_VEHICLE = "config/vehicles/jalalmaab_2015.yaml"
@@ -23,6 +25,8 @@ DEFAULT_POLICY = "policies"
 DEFAULT_FRICTION = 0.9
 DEFAULT_RATE_HZ = 100.0
 
+#: Parameters of the node that name what an option names here.
+_FILES = {"vehicle": "vehicle_file", "policy": "policy_file", "mapping": "signals_file"}
 #: No honest parameter is larger.
 _LARGEST = 1e9
 
@@ -41,6 +45,7 @@ class Choice(NamedTuple):
     strategy : one of `STRATEGIES`
     friction : peak friction coefficient
     settings : settings of the law, as text: ("critical_slip=0.1", ...)
+    mapping : signals file
     """
 
     vehicle: str | None = None
@@ -48,6 +53,7 @@ class Choice(NamedTuple):
     strategy: str | None = None
     friction: float | None = None
     settings: Sequence[str] = ()
+    mapping: str | None = None
 
 
 class PolicyBank:
@@ -114,8 +120,9 @@ class Plan(NamedTuple):
     settings : settings where the bag has recorded none
     friction : where the bag has recorded none
     keeps_friction : the recorded friction is not replaced
-    wheel_names : of the recomputed commands
     period_s : length of a step that has none before it
+    mapping : signals and commands
+    notes : what could not be known of the drive, a line each
     """
 
     vehicle: Vehicle
@@ -124,8 +131,9 @@ class Plan(NamedTuple):
     settings: Settings
     friction: float
     keeps_friction: bool
-    wheel_names: tuple[str, ...]
     period_s: float
+    mapping: SignalMapping
+    notes: tuple[str, ...]
 
 
 def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
@@ -138,8 +146,18 @@ def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
     """
     recorded = recorded_parameters(custom_data)
     idle_drive = recorded.get("idle_drive") or None if choice.vehicle is None else None
-    vehicle_file = choice.vehicle or _packaged(recorded.get("vehicle_file"), "--vehicle") or DEFAULT_VEHICLE
+    missing = {
+        f"--{kind}": name
+        for kind, given in (("vehicle", choice.vehicle), ("policy", choice.policy), ("mapping", choice.mapping))
+        if given is None and (name := str(recorded.get(_FILES[kind], ""))) and not _packaged(name)
+    }
+    ask = f"give the files that the drive was recorded with, or others: {_list(missing)}"
+    if "--vehicle" in missing:
+        raise ConfigError("arguments", "", ask)
+    vehicle_file = choice.vehicle or _packaged(recorded.get("vehicle_file")) or DEFAULT_VEHICLE
     vehicle = load_vehicle(resolve(vehicle_file), idle_drive)
+    mapping = recorded_mapping(choice.mapping, custom_data)
+    vehicle = dataclasses.replace(vehicle, params=mapping.car(vehicle.params))
     changes = {}
     for text in choice.settings:
         name, _, value = text.partition("=")
@@ -150,23 +168,27 @@ def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
     problem = law_settings.check_together(settings._asdict()) if changes else ""
     if problem:
         raise ConfigError("--set", *problem.split(": ", 1))
-    if choice.policy is not None:
-        policy, why_none = choice.policy, ""
-    else:
-        try:
-            policy, why_none = _packaged(recorded.get("policy_file", DEFAULT_POLICY), "--policy"), ""
-        except ConfigError as error:
-            policy, why_none = "", str(error)
+    policy = choice.policy if choice.policy is not None else _packaged(recorded.get("policy_file", DEFAULT_POLICY))
     return Plan(
         vehicle,
-        PolicyBank(policy, _numbers(recorded.get("rule")), vehicle, why_none),
+        PolicyBank(policy, _numbers(recorded.get("rule")), vehicle, ask if "--policy" in missing else ""),
         changes,
         settings,
         choice.friction if choice.friction is not None else _number(recorded, "friction", DEFAULT_FRICTION),
         choice.friction is None,
-        _wheel_names(recorded.get("wheel_names")),
         1.0 / _number(recorded, "rate_hz", DEFAULT_RATE_HZ),
+        mapping,
+        (f"commands and brakes are taken as in {DEFAULT_MAPPING}; {ask}",) if "--mapping" in missing else (),
     )
+
+
+def recorded_mapping(chosen: str | None, custom_data: Mapping[str, str]) -> SignalMapping:
+    """The signals file that was chosen, else that of the package the drive was recorded with, else the standard one."""
+    recorded = recorded_parameters(custom_data)
+    file = resolve(chosen) if chosen else _packaged(recorded.get("signals_file")) or share_path(DEFAULT_MAPPING)
+    mapping = load_mapping(file)
+    standard = mapping.path.resolve() == share_path(DEFAULT_MAPPING).resolve()
+    return mapping.with_wheel_names(_wheel_names(recorded.get("wheel_names"))) if standard else mapping
 
 
 def recorded_parameters(custom_data: Mapping[str, str]) -> dict[str, Any]:
@@ -183,24 +205,20 @@ def recorded_parameters(custom_data: Mapping[str, str]) -> dict[str, Any]:
     return {}
 
 
-def _packaged(name: object, option: str) -> str:
-    """A file of the package that the bag names; it may name no other, because a bag may come from anybody.
-
-    Raises
-    ------
-    ConfigError
-        The drive was recorded with another file, which only the user can give.
-    """
+def _packaged(name: object) -> str:
+    """A file of the package that the bag names, else ""; it may name no other, because a bag may come from anybody."""
     if not name:
         return ""
     try:
         path = resolve(str(name)).resolve()
         folders = [root.resolve() / folder for root in roots() for folder in ("config", "policies")]
-        if path.exists() and any(path.is_relative_to(folder) for folder in folders):
-            return str(path)
+        return str(path) if path.exists() and any(path.is_relative_to(folder) for folder in folders) else ""
     except (OSError, ValueError, RuntimeError):
-        pass  # no file can have such a name
-    raise ConfigError(option, "", f"the drive was recorded with {str(name)[:200]!r}; give that file, or another")
+        return ""  # no file can have such a name
+
+
+def _list(files: Mapping[str, str]) -> str:
+    return ", ".join(f"{option} {name[:200]!r}" for option, name in files.items())
 
 
 def _recorded_settings(recorded: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,25 +16,22 @@ from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS
-from iwm_power_manager.errors import BagError, IwmError
+from iwm_power_manager.errors import BagError, ConfigError
+from iwm_power_manager.replay.commands import RecordedCommand, command_topics, torques_nm
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import SignalStream, check_signals
 from iwm_power_manager.replay.steps import ReconstructedSteps, RecordedSteps, ReplayedStep
 from iwm_power_manager.signals.cdr import UnreadableError
+from iwm_power_manager.signals.commands import CommandWriter
+from iwm_power_manager.signals.contract import POWER_MANAGER_STATE as STATE
 from iwm_power_manager.signals.mapping import JOINT_STATE, SignalMapping, topic_named
-from iwm_power_manager.signals.readings import NamedValues, joint_state_reader, joint_state_writer
+from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import definition_of
 
-MOTOR_COMMAND = "wheel_torque_command"
-FRICTION_COMMAND = "friction_brake_command"
-STATE = "power_manager/state"
 #: How the state's topic ends, whatever its node is called.
 _STATE_OF_ANY = "/state"
 _STATE_READER = joint_state_reader("position")
-#: What a replay computes anew.
-COMPUTED = (MOTOR_COMMAND, FRICTION_COMMAND, STATE)
-
 #: Messages between two calls of `progress`.
 PROGRESS_EVERY = 2000
 #: Readings from the bag's start that show whether its messages come in sets of one stamp.
@@ -62,6 +59,7 @@ class ReplayReport(NamedTuple):
     faults : steps whose command no motor may be given, by reason
     damage : what could not be read of the bag
     comparison : recomputed against recorded, by topic
+    not_compared : commands that were not compared and why, a line each
     """
 
     notes: list[str]
@@ -78,6 +76,7 @@ class ReplayReport(NamedTuple):
     faults: dict[str, int]
     damage: list[str]
     comparison: list[TopicComparison]
+    not_compared: list[str]
 
 
 class Replay:
@@ -87,7 +86,6 @@ class Replay:
     ----------
     bag : open bag
     plan : car, policies, settings
-    mapping : signals, where the bag holds no state of the power manager
     tolerance : largest difference that is none, for the comparison
 
     Raises
@@ -96,33 +94,30 @@ class Replay:
         The bag holds neither a state nor the signals that are needed.
     """
 
-    def __init__(self, bag: BagReader, plan: Plan, mapping: SignalMapping, tolerance: float = 0.0) -> None:
+    def __init__(self, bag: BagReader, plan: Plan, tolerance: float = 0.0) -> None:
         self._bag = bag
         self._plan = plan
-        names = computed_topics(bag)
-        self._state_topic = _with_messages(bag, names.get(STATE))
+        state = state_topic(bag)
+        self._state_topic = _with_messages(bag, state)
         self._recorded: RecordedSteps | None = None
         self._reconstructed: ReconstructedSteps | None = None
         self._stream: SignalStream | None = None
         self._bad_messages = 0
-        self._notes: list[str] = []
+        self._notes = list(plan.notes)
         self._messages = 0
         self._steps = 0
         self._stamps = (0, 0)
         self._span_ns = 0
-        self._comparers = {
-            kind: TopicComparer(name, tolerance, YOUNGER_SIGNALS if kind == STATE else ())
-            for kind, name in names.items()
-        }
-        self._decoders = {
-            name: (kind, joint_state_reader("position" if kind == STATE else "effort")) for kind, name in names.items()
-        }
+        self._state_comparer = TopicComparer(state or STATE, tolerance, YOUNGER_SIGNALS)
+        self._commands: dict[str, RecordedCommand] = {}
+        self._not_compared: list[str] = []
+        self._find_commands(plan.mapping, tolerance)
         if self._state_topic is not None:
             self._recorded = RecordedSteps(plan)
         else:
-            self._stream = SignalStream(bag, mapping, plan.vehicle.params)
-            check_signals(bag, mapping, self._stream, wheels=True)
-            self._notes = [*self._stream.problems, *filter(None, [self._stream.use_log_times()])]
+            self._stream = SignalStream(bag, plan.mapping, plan.vehicle.params)
+            check_signals(bag, plan.mapping, self._stream, wheels=True)
+            self._notes += [*self._stream.problems, *filter(None, [self._stream.use_log_times()])]
             self._reconstructed = ReconstructedSteps(plan, itertools.islice(self._stream, _PROBE_READINGS))
             self._stream.taken.clear()
             self._stream.bad.clear()
@@ -154,6 +149,7 @@ class Replay:
     def report(self) -> ReplayReport:
         """What has been done so far."""
         source = self._recorded or self._reconstructed
+        commands = [command.result() for command in self._commands.values()]
         return ReplayReport(
             [*self._notes, *self._lost_wheels(), *self._too_few_steps()],
             self.exact,
@@ -167,7 +163,8 @@ class Replay:
             self._reconstructed.dropped if self._reconstructed else {},
             dict(source.faults) if source else {},
             self._bag.damage,
-            [result for comparer in self._comparers.values() if (result := comparer.result()).has_record],
+            [found for found in (*commands, self._state_comparer.result()) if found.has_record],
+            self._not_compared,
         )
 
     def why_no_step(self) -> str:
@@ -201,51 +198,66 @@ class Replay:
         return [f"only {self._steps} steps of {wheels} messages: {self.why_no_step()}"]
 
     def _take(self, message: Message) -> list[ReplayedStep]:
-        known = self._decoders.get(message.topic)
-        if known is not None:
-            return self._take_computed(message, *known)
+        if message.topic == self._state_topic:
+            return self._take_state(message)
+        command = self._commands.get(message.topic)
+        if command is not None:
+            try:
+                command.recorded(message)
+            except UnreadableError:
+                self._bad_messages += 1
+            return []
         if self._stream is None or self._reconstructed is None:
             return []
         values = self._stream.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns)
         return self._reconstructed.take(values) if values else []
 
-    def _take_computed(self, message: Message, kind: str, decode: Callable[[bytes], NamedValues]) -> list[ReplayedStep]:
-        """A recorded command or state: what the recomputed one is held against, and where the state is, a step."""
+    def _find_commands(self, mapping: SignalMapping, tolerance: float) -> None:
+        for name, (kind, sink) in command_topics(self._bag, mapping).items():
+            try:
+                command = RecordedCommand(self._bag, mapping, kind, sink, name, tolerance)
+            except (BagError, ConfigError) as error:
+                self._not_compared.append(f"{name}: {error}")
+                continue
+            if command.stamped or self._state_topic is not None:
+                self._commands[name] = command
+            else:
+                self._not_compared.append(f"{name}: carries no stamp, and the bag no state to tell its step")
+        held = {sink.topic for _, sink in command_topics(self._bag, mapping).values()}
+        for kind, sinks in mapping.commands.items():
+            absent = [sink.topic for sink in sinks if sink.topic not in held]
+            if absent:
+                self._not_compared.append(f"{kind} on {', '.join(absent)} ({mapping.path}): not in the bag")
+            elif not sinks:
+                self._not_compared.append(f"{kind}: goes nowhere ({mapping.path})")
+
+    def _take_state(self, message: Message) -> list[ReplayedStep]:
+        """A recorded state: what the recomputed one is held against, and a step."""
+        assert self._recorded is not None
         try:
-            recorded = decode(message.data)
-            steps: list[ReplayedStep] = []
-            if kind == STATE and self._recorded is not None:
-                step = self._recorded.take(recorded, message.log_time_ns, message.publish_time_ns)
-                steps = [step] if step is not None else []
-        except IwmError:
-            raise
+            recorded = _STATE_READER(message.data)
+            step = self._recorded.take(recorded, message.log_time_ns, message.publish_time_ns)
         except KeyError as error:
             raise BagError(
                 f"{self._bag.path}: {message.topic} lacks the signal {error}: recorded by another version"
             ) from None
-        except Exception:  # noqa: BLE001 - generated decoders raise whatever a damaged message makes them raise
+        except (UnreadableError, ValueError):
             self._bad_messages += 1
             return []
         names, values = recorded.names, recorded.values
-        if kind == STATE and list(names) == SIGNAL_NAMES:
+        if list(names) == SIGNAL_NAMES:
             names, values = DECIDED_NAMES, values[_FIRST_DECIDED : _FIRST_DECIDED + len(DECIDED_NAMES)]
-        elif kind == STATE:
+        else:
             found = dict(zip(names, values, strict=True))
             names = tuple(name for name in DECIDED_NAMES if name in found)
             values = tuple(found[name] for name in names)
-        self._comparers[kind].recorded(recorded.stamp_ns, message.log_time_ns, names, values)
-        return steps
+        self._state_comparer.recorded(recorded.stamp_ns, message.log_time_ns, names, values)
+        return [step] if step is not None else []
 
     def _compare(self, step: ReplayedStep) -> None:
-        names = self._plan.wheel_names
-        for kind, wanted, values in (
-            (MOTOR_COMMAND, names, step.command.motor_torque_nm),
-            (FRICTION_COMMAND, names, step.command.friction_torque_nm),
-            (STATE, DECIDED_NAMES, decided_values(step)),
-        ):
-            comparer = self._comparers.get(kind)
-            if comparer is not None:
-                comparer.recomputed(step.stamp_ns, step.log_time_ns, wanted, tuple(values))
+        for command in self._commands.values():
+            command.recomputed(step)
+        self._state_comparer.recomputed(step.stamp_ns, step.log_time_ns, DECIDED_NAMES, decided_values(step))
 
 
 class ReplayOutput:
@@ -255,22 +267,27 @@ class ReplayOutput:
     ----------
     writer : new bag
     bag : bag that is replayed
-    plan : for the wheels' names
+    plan : where the commands go
     """
 
     def __init__(self, writer: BagWriter, bag: BagReader, plan: Plan) -> None:
         self._writer = writer
         self._sequence = 0
-        computed = computed_topics(bag)
+        mapping = plan.mapping
+        recorded = {sink.topic: name for name, (_, sink) in command_topics(bag, mapping).items()}
+        state = state_topic(bag)
+        computed = {*recorded.values(), state}
         self._copied = {
-            name: writer.add_topic(topic) for name, topic in sorted(bag.topics.items()) if name not in computed.values()
+            name: writer.add_topic(topic) for name, topic in sorted(bag.topics.items()) if name not in computed
         }
-        self._numbers = []
-        for kind in COMPUTED:
-            new = Topic(f"/{kind}", JOINT_STATE, *definition_of(JOINT_STATE), (DEFAULT_QOS._replace(depth=100),))
-            topic = bag.topics[computed[kind]] if kind in computed else new
-            self._numbers.append(writer.add_topic(topic))
-        self._wheels = joint_state_writer(plan.wheel_names, "effort")
+        types = {sink.topic: sink.type for sinks in mapping.commands.values() for sink in sinks}
+        names = {topic: recorded.get(topic, f"/{topic.lstrip('/')}") for topic in types}
+        self._numbers = {
+            topic: writer.add_topic(bag.topics.get(name) or _new_topic(name, types[topic]))
+            for topic, name in names.items()
+        }
+        self._state_number = writer.add_topic(bag.topics[state] if state else _new_topic(f"/{STATE}", JOINT_STATE))
+        self._commands = {kind: CommandWriter(mapping.path, sinks) for kind, sinks in mapping.commands.items()}
         self._state = joint_state_writer(SIGNAL_NAMES, "position")
 
     def write(self, message: Message, steps: Sequence[ReplayedStep]) -> None:
@@ -280,16 +297,17 @@ class ReplayOutput:
             self._writer.write(number, message.log_time_ns, message.data, message.publish_time_ns, message.sequence)
         for step in steps:
             self._sequence += 1
-            for topic, data in zip(
-                self._numbers,
-                (
-                    self._wheels(step.stamp_ns, step.command.motor_torque_nm),
-                    self._wheels(step.stamp_ns, step.command.friction_torque_nm),
-                    self._state(step.stamp_ns, step.values),
-                ),
-                strict=True,
-            ):
-                self._writer.write(topic, step.log_time_ns, data, step.publish_time_ns, self._sequence)
+            sent = [
+                (self._numbers[topic], data)
+                for kind, write in self._commands.items()
+                for topic, data in write(step.stamp_ns, torques_nm(step, kind))
+            ]
+            for number, data in (*sent, (self._state_number, self._state(step.stamp_ns, step.values))):
+                self._writer.write(number, step.log_time_ns, data, step.publish_time_ns, self._sequence)
+
+
+def _new_topic(name: str, msgtype: str) -> Topic:
+    return Topic(name, msgtype, *definition_of(msgtype), (DEFAULT_QOS._replace(depth=100),))
 
 
 def exceeds(comparison: Sequence[TopicComparison], tolerance: float) -> bool:
@@ -302,28 +320,27 @@ def decided_values(step: ReplayedStep) -> tuple[float, ...]:
     return tuple(step.values[_FIRST_DECIDED : _FIRST_DECIDED + len(DECIDED_NAMES)])
 
 
-def computed_topics(bag: BagReader) -> dict[str, str]:
-    """The bag's topics of the commands and the state, by the names of `COMPUTED`; those it does not have are left out.
+def state_topic(bag: BagReader) -> str | None:
+    """The bag's topic of the power manager's state, if it has one.
 
-    The state is private to its node: where the node had another name, it is the one topic `<node>/state` that carries
-    the numbers of a step.
+    It is private to its node: where the node had another name, it is the one topic `<node>/state` that carries the
+    numbers of a step.
 
     Raises
     ------
     BagError
-        One of them was recorded in several namespaces, or the state of several nodes.
+        It was recorded in several namespaces, or of several nodes.
     """
-    found = {kind: name for kind in COMPUTED if (name := topic_named(kind, bag.topics)) is not None}
-    if STATE not in found:
-        candidates = [
-            name for name, topic in bag.topics.items() if topic.type == JOINT_STATE and name.endswith(_STATE_OF_ANY)
-        ]
-        states = [name for name in candidates if _carries_steps(bag, name)]
-        if len(states) > 1:
-            raise BagError(f"{bag.path}: holds the states of several nodes: {', '.join(sorted(states))}")
-        if states:
-            found[STATE] = states[0]
-    return found
+    name = topic_named(STATE, bag.topics)
+    if name is not None:
+        return name
+    candidates = [
+        name for name, topic in bag.topics.items() if topic.type == JOINT_STATE and name.endswith(_STATE_OF_ANY)
+    ]
+    states = [name for name in candidates if _carries_steps(bag, name)]
+    if len(states) > 1:
+        raise BagError(f"{bag.path}: holds the states of several nodes: {', '.join(sorted(states))}")
+    return states[0] if states else None
 
 
 def _carries_steps(bag: BagReader, topic: str) -> bool:

@@ -21,9 +21,8 @@ from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.replay.plan import Plan
-from iwm_power_manager.replay.run import STATE, Replay, computed_topics
+from iwm_power_manager.replay.run import Replay, state_topic
 from iwm_power_manager.signals.contract import WHEEL_NAMES
-from iwm_power_manager.signals.mapping import SignalMapping
 from iwm_power_manager.signals.readings import joint_state_reader
 
 _J_PER_WH = 3600.0
@@ -104,7 +103,6 @@ class EnergyMeter:
 def what_if(
     bag: BagReader,
     plans: Sequence[tuple[str, Plan]],
-    mapping: SignalMapping,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Consumption]:
     """Consumption of the recorded commands, where the bag has them, and of each plan, at the force of the first.
@@ -121,8 +119,8 @@ def what_if(
     vehicle = plans[0][1].vehicle.params
     forces_n: dict[int, float] = {}
     results = []
-    state = computed_topics(bag).get(STATE)
-    if state is not None and Replay(bag, plans[0][1], mapping).exact:
+    state = state_topic(bag)
+    if state is not None and Replay(bag, plans[0][1]).exact:
         meter = EnergyMeter("recorded", vehicle)
         for stamp_ns, step in _recorded_steps(bag, state):
             forces_n[stamp_ns] = force_n(vehicle, *step)
@@ -130,7 +128,7 @@ def what_if(
         results.append(meter.result())
     for label, plan in plans:
         meter = EnergyMeter(label, vehicle)
-        replay = Replay(bag, plan, mapping)
+        replay = Replay(bag, plan)
         first = not results
         for _, steps in replay.steps(progress):
             for done in steps:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple
 
 import rclpy
@@ -25,7 +25,6 @@ from rosgraph_msgs.msg import Clock
 
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.errors import BagError, one_line
-from iwm_power_manager.replay.run import computed_topics
 from iwm_power_manager.ros import ending
 from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.messages import CLOCK, clock_message
@@ -54,6 +53,7 @@ class PlayOptions(NamedTuple):
     start_s, end_s : part of the bag, from its begin; None for its end
     loop : begin again at the end
     topics : those to play; () for all but commands and reports
+    commands : topics of the bag that others command
     listeners : begin when each topic has so many; 0: when somebody listens and no more listeners appear
     """
 
@@ -63,6 +63,7 @@ class PlayOptions(NamedTuple):
     end_s: float | None = None
     loop: bool = False
     topics: tuple[str, ...] = ()
+    commands: Collection[str] = ()
     listeners: int = 0
 
 
@@ -97,7 +98,7 @@ class _Player:
         self._bag = bag
         self._options = options
         self._interruption = interruption
-        self._publishers, problems = _publishers(node, bag, options.topics)
+        self._publishers, problems = _publishers(node, bag, options)
         for line in problems:
             print(f"replay: {line}", file=sys.stderr)
         self._clock = node.create_publisher(Clock, CLOCK, QoSProfile(depth=_DEPTH))
@@ -178,12 +179,11 @@ class _Player:
         return True
 
 
-def _chosen(bag: BagReader, topics: tuple[str, ...]) -> list[str]:
-    if not topics:
-        commands = set(computed_topics(bag).values())
-        return [name for name in bag.topics if name not in commands and name not in _NOT_PLAYED]
+def _chosen(bag: BagReader, options: PlayOptions) -> list[str]:
+    if not options.topics:
+        return [name for name in bag.topics if name not in options.commands and name not in _NOT_PLAYED]
     names = []
-    for wanted in topics:
+    for wanted in options.topics:
         name = topic_named(wanted, bag.topics)
         if name is None:
             raise BagError(f"{bag.path}: holds no topic {wanted}; it holds {', '.join(sorted(bag.topics))}")
@@ -191,11 +191,11 @@ def _chosen(bag: BagReader, topics: tuple[str, ...]) -> list[str]:
     return names
 
 
-def _publishers(node: Node, bag: BagReader, topics: tuple[str, ...]) -> tuple[dict[str, Any], list[str]]:
+def _publishers(node: Node, bag: BagReader, options: PlayOptions) -> tuple[dict[str, Any], list[str]]:
     """A publisher for each chosen topic, and a line for each that cannot be played here."""
     found: dict[str, Any] = {}
     problems = []
-    for name in _chosen(bag, topics):
+    for name in _chosen(bag, options):
         try:
             found[name] = _publisher(node, bag, name)
         except Exception as error:  # noqa: BLE001 - rclpy has several for names and types that are none

@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.files import check_choice, check_keys, check_number, dotted, read_yaml
+from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.commands import Sink, read_commands, signs, standard, wheel_names
+from iwm_power_manager.signals.commands import FRICTION, Sink, read_commands, signs, standard, wheel_names
 
 DEFAULT_MAPPING = "config/signals/standard.yaml"
 
@@ -155,6 +156,11 @@ class SignalMapping(NamedTuple):
             for kind, sinks in self.commands.items()
         }
         return self._replace(sources=sources, commands=commands)
+
+    def car(self, vehicle: VehicleParams) -> VehicleParams:
+        """The car as the law may count on it: where another system has the brakes, without any."""
+        without = vehicle.front.friction_brake._replace(max_torque_nm=0.0)
+        return vehicle if self.commands[FRICTION] else vehicle.with_axles(friction_brake=without)
 
     def check_live(self) -> None:
         """Refuse what the node could not drive with.

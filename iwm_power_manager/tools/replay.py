@@ -25,11 +25,10 @@ from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.control.strategies import drivable, name_of
 from iwm_power_manager.errors import BagError, ConfigError, IwmError, one_line
 from iwm_power_manager.files import atomic_write, check_number
-from iwm_power_manager.replay.plan import Choice, Plan, make_plan
-from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds
+from iwm_power_manager.replay.commands import command_topics
+from iwm_power_manager.replay.plan import Choice, Plan, make_plan, recorded_mapping
+from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds, state_topic
 from iwm_power_manager.replay.what_if import Consumption, what_if
-from iwm_power_manager.share import resolve
-from iwm_power_manager.signals.mapping import SignalMapping, load_mapping
 from iwm_power_manager.tools.command import described
 
 DONE, DIFFERENT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -62,8 +61,7 @@ def main(args: Sequence[str] | None = None) -> int:
         if options.publish:
             return _publish(options)
         with BagReader(options.bag) as bag:
-            mapping = load_mapping(resolve(options.mapping) if options.mapping else None)
-            return _what_if(bag, mapping, options) if options.what_if else _replay(bag, mapping, options)
+            return _replay(bag, options) if options.what_if is None else _what_if(bag, options)
     except IwmError as error:
         print(f"replay: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -89,7 +87,13 @@ def _parser() -> argparse.ArgumentParser:
     out.add_argument("--output", metavar="DIR", help="write a bag: inputs as recorded, commands recomputed")
     out.add_argument("--compare", action="store_true", help="recomputed against recorded; exit code 1 if they differ")
     out.add_argument("--tolerance", type=float, default=0.0, metavar="X", help="difference that is none (default 0)")
-    out.add_argument("--what-if", metavar="YAML", help="energy this car would have taken, for each --strategy")
+    out.add_argument(
+        "--what-if",
+        metavar="YAML",
+        nargs="?",
+        const="",
+        help="energy this car would have taken, for each --strategy; default: the car of --vehicle, else of the bag",
+    )
     out.add_argument("--json", metavar="FILE", help="write the result as JSON; - for standard output")
     out.add_argument("--quiet", action="store_true", help="no progress bar")
     play = parser.add_argument_group("publishing")
@@ -105,11 +109,15 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _check(options: argparse.Namespace) -> None:
-    if options.publish and (options.output or options.compare or options.what_if):
+    if options.publish and (options.output or options.compare or options.what_if is not None):
         raise ConfigError("arguments", "--publish", "excludes --output, --compare and --what-if")
-    if options.what_if and (options.output or options.compare or options.vehicle):
-        raise ConfigError("arguments", "--what-if", "excludes --output, --compare and --vehicle")
-    if not options.what_if and len(options.strategy or []) > 1:
+    if options.what_if is not None and (options.output or options.compare):
+        raise ConfigError("arguments", "--what-if", "excludes --output and --compare")
+    if options.what_if and options.vehicle:
+        raise ConfigError(
+            "arguments", "--what-if", f"names another car than --vehicle: {options.what_if}", "one of them"
+        )
+    if options.what_if is None and len(options.strategy or []) > 1:
         raise ConfigError("arguments", "--strategy", "several make sense with --what-if only")
     check_number("arguments", "--tolerance", options.tolerance, 0.0)
     check_number("arguments", "--rate", options.rate, 0.001, 1000.0)
@@ -122,13 +130,13 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _plan(bag: BagReader, options: argparse.Namespace, vehicle: str | None, strategy: str | None) -> Plan:
-    choice = Choice(vehicle, options.policy, strategy, options.friction, options.settings)
+    choice = Choice(vehicle, options.policy, strategy, options.friction, options.settings, options.mapping)
     return make_plan(choice, bag.custom_data)
 
 
-def _replay(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace) -> int:
+def _replay(bag: BagReader, options: argparse.Namespace) -> int:
     plan = _plan(bag, options, options.vehicle, options.strategy[0] if options.strategy else None)
-    replay = Replay(bag, plan, mapping, options.tolerance)
+    replay = Replay(bag, plan, options.tolerance)
     started_s = time.perf_counter()
     writer = None
     if options.output:
@@ -163,11 +171,12 @@ def _replay(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace)
     return DIFFERENT if options.compare and exceeds(report.comparison, options.tolerance) else DONE
 
 
-def _what_if(bag: BagReader, mapping: SignalMapping, options: argparse.Namespace) -> int:
-    names = options.strategy or ["equal", name_of(_plan(bag, options, options.what_if, None).settings.strategy)]
-    plans = [(name, _plan(bag, options, options.what_if, name)) for name in dict.fromkeys(names)]
+def _what_if(bag: BagReader, options: argparse.Namespace) -> int:
+    car = options.what_if or options.vehicle
+    names = options.strategy or ["equal", name_of(_plan(bag, options, car, None).settings.strategy)]
+    plans = [(name, _plan(bag, options, car, name)) for name in dict.fromkeys(names)]
     with _progress(bag, options, len(plans)) as progress:
-        rows = what_if(bag, plans, mapping, progress)
+        rows = what_if(bag, plans, progress)
     savings = [row.saving_percent(rows[0]) for row in rows]
     lines = [
         f"{bag.path}: open-loop estimate for {plans[0][1].vehicle.name}, idle drive {plans[0][1].vehicle.idle_drive}",
@@ -203,6 +212,7 @@ def _publish(options: argparse.Namespace) -> int:
                 options.end,
                 options.loop,
                 tuple(options.topics or ()),
+                {*command_topics(bag, recorded_mapping(options.mapping, bag.custom_data)), state_topic(bag) or ""},
                 options.listeners,
             ),
         )
@@ -276,6 +286,7 @@ def _comparison_lines(report: ReplayReport) -> list[str]:
                 f"    first at message {first.message}, stamp {first.stamp_ns * 1e-9:.9f} s: {first.name} "
                 f"recorded {first.recorded!r}, recomputed {first.recomputed!r}"
             )
+    lines += [f"  not compared: {line}" for line in report.not_compared]
     if not any(topic.compared for topic in report.comparison):
         lines.append("  nothing to compare: no recorded command has the stamp of a recomputed one")
     return lines

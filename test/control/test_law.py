@@ -58,6 +58,8 @@ CARS["unequal"] = CAR._replace(
         track_width_m=1.2,
     )
 )
+#: The brakes are another system's.
+CARS["without brakes"] = CAR.with_axles(friction_brake=CAR.front.friction_brake._replace(max_torque_nm=0.0))
 RADIUS = CAR.front.wheel.radius_m
 TABLE = empty_table(rule=(300.0, 0.4, -200.0, 0.7), schedule=(0.5, 0.0, 1.0, 0.3, 0.85, 1.0))
 DEFAULT = default_settings("equal")
@@ -394,6 +396,8 @@ def braking_always_gets_through(case):
         return
     wheels = case.wheels()
     most = [case.axle(i).friction_brake.max_torque_nm for i in range(4)]
+    if not any(most):
+        return  # what the motors cannot give is another system's
     owed = max(case.m.power_demand_w, -sum(case.conversion(i) * most[i] for i in range(4)))
     if any(motor > 0.0 and brake == -most[i] for i, (_, motor, brake, *_) in enumerate(wheels)):
         return  # a full brake has nothing left to hold against a motor on its way down from driving
@@ -812,6 +816,19 @@ def test_the_friction_brakes_own_limit_is_kept_and_said():
     case = settle(measurement(demand=-1e6), off)
     assert [a + b for a, b in zip(*case.command[:2], strict=True)] == pytest.approx([-900.0] * 4)
     assert case.command.limits & t.LIMIT_FRICTION_BRAKE
+
+
+@pytest.mark.parametrize("strategy", ["equal", "rule"])
+def test_without_friction_brakes_all_four_motors_regenerate_as_much_as_they_can(strategy):
+    """Whatever the split asks of an axle: nobody else gives what one of them could."""
+    car = CARS["without brakes"]
+    case = settle(measurement(speed=10.0, demand=-20e3), default_settings(strategy), car=car)
+    assert case.command.friction_torque_nm == (0.0,) * 4
+    assert case.command.motor_torque_nm == pytest.approx((-80.0,) * 4)
+    assert case.command.limits & t.LIMIT_REGENERATION
+    assert not case.command.limits & t.LIMIT_FRICTION_BRAKE
+    slow = settle(measurement(speed=0.5, demand=-600.0), default_settings(strategy), car=car)
+    assert slow.command.motor_torque_nm == slow.command.friction_torque_nm == (0.0,) * 4
 
 
 # --- The slip limiter, with the wheel and the tyre it steers ---------------------------------------------------------

@@ -199,7 +199,8 @@ def step(m, state, settings, vehicle, decide):
             held = max(m.speed_mps * (1.0 - settings.critical_slip), floor) / wheel.axle.wheel.radius_m
             turning = min(wheel.speed, 1.12 * m.speed_mps / wheel.axle.wheel.radius_m) if braking else wheel.speed
             wheel.conversion = max(turning, held)
-            brake = wheel.axle.friction_brake.max_torque_nm
+            weakest = regeneration_limit(wheel.fast, m.speed_mps, wheel.before.heat, wheel.axle.motor)
+            brake = wheel.axle.friction_brake.max_torque_nm or weakest
             wheel.room = brake if braking else torque_limit(wheel.fast, wheel.before.heat, wheel.axle.motor)
             if settings.gate_mode == GATE_MODE_LIMITER:
                 wheel.grip = grip(braking, wheel.road, wheel.speed, m.speed_mps, settings, wheel.axle)
@@ -255,7 +256,7 @@ def _torque(wheel, short, braking, m, settings, bits):
         if wheel.grip < wheel.room:
             bits.add(t.LIMIT_SLIP)
         elif braking:
-            bits.add(t.LIMIT_FRICTION_BRAKE)
+            bits.add(t.LIMIT_FRICTION_BRAKE if wheel.axle.friction_brake.max_torque_nm else t.LIMIT_REGENERATION)
         else:
             bits.add(t.LIMIT_MOTOR)
             if wheel.room < torque_limit(wheel.fast, 0.0, motor):

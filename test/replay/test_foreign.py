@@ -32,7 +32,7 @@ def mapping(tmp_path: Path) -> Path:
 def replayed(bag: Path, mapping: Path) -> tuple[Any, list[float]]:
     """Report of a replay with equal split, and the speeds the law took."""
     with BagReader(bag) as reader:
-        replay = Replay(reader, make_plan(Choice(strategy="equal"), {}), load_mapping(mapping))
+        replay = Replay(reader, make_plan(Choice(strategy="equal", mapping=str(mapping)), {}))
         speeds = [step.values[0] for _, steps in replay.steps() for step in steps]
         return replay.report(), speeds
 

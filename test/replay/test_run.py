@@ -24,7 +24,6 @@ from iwm_power_manager.replay.compare import TopicComparer
 from iwm_power_manager.replay.plan import Choice, make_plan, recorded_parameters
 from iwm_power_manager.replay.run import STATE, Replay
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.mapping import load_mapping
 from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import standard_types
 from iwm_power_manager.tools.replay import BAD_INPUT, DIFFERENT, DONE, main
@@ -553,7 +552,7 @@ def test_a_state_of_another_version_is_refused_by_name(tmp_path: Path, capsys: p
 def test_progress_is_called_with_messages_and_time(drive: Path) -> None:
     seen: list[tuple[int, int]] = []
     with BagReader(drive) as bag:
-        replay = Replay(bag, make_plan(Choice(strategy="equal"), bag.custom_data), load_mapping())
+        replay = Replay(bag, make_plan(Choice(strategy="equal"), bag.custom_data))
         from iwm_power_manager.replay import run as module
 
         every = module.PROGRESS_EVERY

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -14,6 +15,8 @@ from bench import Running, arguments
 from stack import JOINTS, NUMBER, NUMBERS, Stack, number, of_type
 
 from iwm_power_manager.share import share_path
+from iwm_power_manager.signals.contract import WHEEL_NAMES
+from iwm_power_manager.tools.replay import main as replay
 from iwm_power_manager.vehicle import load_vehicle
 
 MODULE = "iwm_power_manager.nodes.power_manager"
@@ -173,6 +176,76 @@ def test_ros2_control_is_commanded_in_the_order_of_its_joints(
     rear, front = (400.0 * RADIUS_M * part / 2.0 for part in (0.25, 0.75))
     expected = pytest.approx([rear, rear, front, front], rel=0.02)
     car.stack.drive(inputs, lambda: commanded() == expected, "400 N", 1.0 / rate_hz)
+
+
+def test_a_drive_on_mapped_topics_is_recorded_without_naming_them_and_its_commands_are_compared(
+    connect: Callable[..., Connected], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Commands without a stamp, each to a topic of its own; the brakes are another system's."""
+    sends = {"speed_kmh": TWIST, "wanted": ACCEL, "charge": NUMBER} | {f"rpm_{i}": NUMBER for i in range(4)}
+    hears = {f"torque_{i}": NUMBER for i in range(4)} | {
+        "power_manager/state": JOINTS,
+        "recorder/ready": "std_msgs/msg/Bool",
+    }
+    car = connect(FOUR_TOPICS, sends, hears)
+    name = car.stack.node.get_namespace()
+    signals = tmp_path / "signals.yaml"
+    recording = {"output": tmp_path / "bag", "signals_file": signals}
+    recorder = Running(
+        "iwm_power_manager.nodes.recorder", arguments(recording, {"__ns": name, "/diagnostics": f"{name}/diagnostics"}),
+        DOMAIN, tmp_path,
+    )  # fmt: skip
+    wanted = 1.0
+
+    def inputs(stack: Stack) -> dict[str, Any]:
+        rpm = 10.0 / RADIUS_M * 30.0 / math.pi
+        speeds = {f"rpm_{i}": number(rpm if i % 2 == 0 else -rpm) for i in range(4)}
+        acceleration = of_type(ACCEL, header__stamp=stack.stamp(), accel__linear__x=wanted)
+        return {"speed_kmh": of_type(TWIST, linear__x=36.0), "wanted": acceleration, "charge": number(80.0), **speeds}
+
+    def torques() -> list[float]:
+        found = [car.stack.last(f"torque_{i}") for i in range(4)]
+        return [message.data for message in found] if all(found) else [0.0] * 4
+
+    def state() -> dict[str, float]:
+        message = car.stack.last("power_manager/state")
+        return dict(zip(message.name, message.position, strict=True)) if message else {}
+
+    try:
+        car.stack.drive(inputs, lambda: recorder.text().count("ready") and torques()[0] > 50.0, "drive torque")
+        wanted = -6.0
+        limit = CAR.front.motor.regeneration_torque_nm
+        full = pytest.approx([-limit, limit, -limit, limit])
+        car.stack.drive(inputs, lambda: torques() == full, "all four motors regenerate as hard as they can")
+        # Nobody is told to brake with brakes that are not there.
+        assert [state()[f"{wheel}_friction_torque_nm"] for wheel in WHEEL_NAMES] == [0.0] * 4
+        car.stack.drive(inputs, lambda: "limits that bind: regeneration" in values(car.stack, "control"), "the status")
+        assert recorder.stop() == 0
+    finally:
+        recorder.process.kill()
+        recorder.process.wait()
+    bag = str(tmp_path / "bag")
+    assert replay([bag, "--compare", "--mapping", str(signals), "--json", str(tmp_path / "found.json"), "--quiet"]) == 0
+    found = json.loads((tmp_path / "found.json").read_text())
+    compared = {row["topic"]: row["compared"] for row in found["comparison"]}
+    assert set(compared) == {f"{name}/{topic}" for topic in (*(f"torque_{i}" for i in range(4)), "power_manager/state")}
+    assert min(compared.values()) > 50
+    assert f"not compared: friction_torque: goes nowhere ({signals})" in capsys.readouterr().out
+    assert replay([bag, "--compare", "--quiet"]) == 1  # with brakes that were not there
+    text = capsys.readouterr().out
+    assert f"give the files that the drive was recorded with, or others: --mapping '{signals}'" in text
+    assert "not compared: motor_torque on wheel_torque_command" in text
+    assert replay([bag, "--what-if", "--vehicle", "jalalmaab_2015", "--mapping", str(signals), "--quiet"]) == 0
+    rows = [
+        line.split() for line in capsys.readouterr().out.splitlines() if line.startswith(("  recorded ", "  equal "))
+    ]
+    assert [float(row[4]) for row in rows] == [0.0, 0.0], "no friction brakes"
+
+
+def values(stack: Stack, name: str) -> str:
+    """Values of a status of the last diagnostics, as lines."""
+    statuses = stack.diagnostics[-1].status if stack.diagnostics else []
+    return "; ".join(f"{v.key}: {v.value}" for s in statuses if s.name.endswith(f": {name}") for v in s.values)
 
 
 WRONG_IN_THREE_WAYS = """

@@ -18,9 +18,10 @@ import foreign_bags as foreign
 from bags_helpers import ScriptedDrive
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.policy import load_policy, save_policy
-from iwm_power_manager.replay.run import FRICTION_COMMAND, MOTOR_COMMAND
 from iwm_power_manager.ros.player import paced
 from iwm_power_manager.share import share_path
+from iwm_power_manager.signals.contract import FRICTION_BRAKE_COMMAND as FRICTION_COMMAND
+from iwm_power_manager.signals.contract import WHEEL_TORQUE_COMMAND as MOTOR_COMMAND
 from iwm_power_manager.tools.replay import DIFFERENT, DONE, main
 
 PATIENCE_S = 90.0

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands of a bag, on the topics its signals file gave them: what was sent, and what would be sent."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Sequence
+
+from iwm_power_manager.bags.reader import BagReader, Message
+from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
+from iwm_power_manager.replay.steps import ReplayedStep
+from iwm_power_manager.signals.cdr import MessageReader, names_path
+from iwm_power_manager.signals.commands import MOTOR, CommandWriter, Sink
+from iwm_power_manager.signals.contract import WHEEL_NAMES
+from iwm_power_manager.signals.mapping import SignalMapping, topic_named
+from iwm_power_manager.signals.readings import NamedValues
+from iwm_power_manager.signals.types import types_of
+
+#: Steps back that a command without a stamp may belong to: it may be recorded after the state that was sent after it.
+_RECENT = 1000
+
+
+class RecordedCommand:
+    """One topic of commands: its recorded messages, held against what the replayed steps would send.
+
+    A message without a stamp belongs to the step whose state was sent next after it.
+
+    Parameters
+    ----------
+    bag : that holds it
+    mapping, kind, sink : what it carries
+    name : of the topic in the bag
+    tolerance : largest difference that is none
+
+    Attributes
+    ----------
+    kind, name : as given
+    stamped : the messages carry a stamp
+
+    Raises
+    ------
+    BagError, ConfigError
+        Its type is not known here, or not what the mapping says.
+    """
+
+    def __init__(
+        self, bag: BagReader, mapping: SignalMapping, kind: str, sink: Sink, name: str, tolerance: float
+    ) -> None:
+        topic = bag.topics[name]
+        self.kind, self.name = kind, name
+        self._names = tuple(sink.names[wheel] if sink.names else WHEEL_NAMES[wheel] for wheel in sink.wheels)
+        self._write = CommandWriter(mapping.path, [sink])
+        self._read = MessageReader(
+            types_of(topic.type, topic.encoding, topic.definition),
+            [sink.field],
+            self._made,
+            names_path(sink.field) if sink.names else "",
+        )
+        self.stamped = self._read.stamped
+        self._comparer = TopicComparer(name, tolerance)
+        self._sent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
+        self._waiting: list[tuple[int, int, NamedValues]] = []
+        self._alone = 0
+
+    def _made(
+        self, stamp_ns: int, values: tuple[float | tuple[float, ...], ...], names: tuple[str, ...]
+    ) -> NamedValues:
+        value = values[0]
+        return NamedValues(stamp_ns, names or self._names, value if isinstance(value, tuple) else (value,))
+
+    def recorded(self, message: Message) -> None:
+        """Take a recorded message; `UnreadableError` if it is none."""
+        found = self._read(message.data)
+        if self.stamped:
+            self._comparer.recorded(found.stamp_ns, message.log_time_ns, found.names, found.values)
+            return
+        place = bisect_left(self._sent, (message.publish_time_ns, -1))
+        if place < len(self._sent):
+            self._comparer.recorded(self._sent[place][1], message.log_time_ns, found.names, found.values)
+        else:
+            self._waiting.append((message.publish_time_ns, message.log_time_ns, found))
+
+    def recomputed(self, step: ReplayedStep) -> None:
+        """Take a replayed step."""
+        if not self.stamped:
+            self._sent.append((step.publish_time_ns, step.stamp_ns))
+            due = [one for one in self._waiting if one[0] <= step.publish_time_ns]
+            self._waiting = self._waiting[len(due) :]
+            for _, log_time_ns, found in due[:-1]:  # zero torque, as at the end of commanding, belongs to no step
+                self._alone += 1
+                self._comparer.recorded(-self._alone, log_time_ns, found.names, found.values)
+            for _, log_time_ns, found in due[-1:]:
+                self._comparer.recorded(step.stamp_ns, log_time_ns, found.names, found.values)
+        ((_, data),) = self._write(step.stamp_ns, torques_nm(step, self.kind))
+        sent = self._read(data)
+        self._comparer.recomputed(step.stamp_ns, step.log_time_ns, sent.names, sent.values)
+
+    def result(self) -> TopicComparison:
+        """What has been found so far."""
+        return self._comparer.result()
+
+
+def torques_nm(step: ReplayedStep, kind: str) -> Sequence[float]:
+    """What a step commands to the motors, or to the brakes."""
+    return step.command.motor_torque_nm if kind == MOTOR else step.command.friction_torque_nm
+
+
+def command_topics(bag: BagReader, mapping: SignalMapping) -> dict[str, tuple[str, Sink]]:
+    """Kind and sink of each command that the bag holds, by its topic there."""
+    return {
+        name: (kind, sink)
+        for kind, sinks in mapping.commands.items()
+        for sink in sinks
+        if (name := topic_named(sink.topic, bag.topics)) is not None
+    }
