@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 import json
+import time
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 from rclpy.task import Future
+
+#: An answer may be lost where its sender has not found who asked; then it is asked again.
+_AGAIN_S = 5.0
 
 
 class RemoteParameters:
@@ -56,9 +60,13 @@ class _Question:
         self._names: list[str] = []
         self._listing: Future | None = None
         self._getting: Future | None = None
+        self._asked_s = time.monotonic()
 
     def advance(self) -> str | None:
         """Do the next step that is due; the answer once it is there."""
+        if time.monotonic() - self._asked_s > _AGAIN_S:
+            self._asked_s = time.monotonic()
+            self._listing = self._getting = None
         if self._listing is None:
             if self._lister.service_is_ready() and self._getter.service_is_ready():
                 self._listing = self._lister.call_async(ListParameters.Request())
