@@ -184,6 +184,8 @@ def _what_if(bag: BagReader, options: argparse.Namespace) -> int:
         *(_consumption_line(row, saving) for row, saving in zip(rows, savings, strict=True)),
         f"  at the force of {rows[0].label}, step by step; it tells losses, not how slip or the driver would differ",
     ]
+    if used := sorted({checksum[:12] for _, plan in plans for checksum in plan.policies.checksums}):
+        lines.append(f"  policies {', '.join(used)}; settings as recorded, unless --set or --strategy says otherwise")
     if None in savings:
         lines.append("  no saving where the motors could not give that force: the work at the wheels is another")
     lines += [f"  damaged: {line}" for line in bag.damage]
