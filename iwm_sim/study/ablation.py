@@ -18,7 +18,7 @@ from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
 from iwm_power_manager.solve import load_grid
 from iwm_sim.study import cases, labels
 from iwm_sim.study.cases import Case
-from iwm_sim.study.driving import drive_all
+from iwm_sim.study.driving import Progress, drive_all
 from iwm_sim.study.plan import STRATEGY, Policies, variant
 from iwm_sim.study.policies import solved
 from iwm_sim.study.report import Column
@@ -84,6 +84,7 @@ def ablation(
     jobs: int,
     say: Callable[[str], None],
     places: Sequence[tuple[str, float]] = PLACES,
+    quiet: bool = True,
 ) -> list[Ablated]:
     """Solve and drive every variant; grids go to a folder, policies are kept in the user's cache.
 
@@ -94,6 +95,7 @@ def ablation(
     jobs : processes
     say : told of everything that is solved
     places : cycles with frictions
+    quiet : no progress bar
     """
     folder.mkdir(parents=True, exist_ok=True)
     wanted: list[Case] = []
@@ -106,8 +108,8 @@ def ablation(
             *(_changed(base, name, steps, policies, folder, say) for name, steps in TOGETHER.items()),
             replace(base, strategy=STRATEGY, label=labels.OURS, policy=policies.ours("none", friction)),
         ]
-    say(f"driving {len(wanted)} cases")
-    by = by_place(rows_of(drive_all(wanted, jobs)))
+    with Progress(len(wanted), quiet) as progress:
+        by = by_place(rows_of(drive_all(wanted, jobs, progress.update)))
     driven = {
         f"{cycle} {friction:g}": by[Place(cycle, friction, "none")]
         for cycle, friction in ((cases.cycle_of(path).name, friction) for path, friction in places)

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from iwm_sim.study import battery_fit, cases, labels, paper
-from iwm_sim.study.cases import Case, Result
+from iwm_sim.study.cases import Case
 from iwm_sim.study.content import frontier_of
-from iwm_sim.study.driving import drive_all
+from iwm_sim.study.driving import Progress, drive_all
 from iwm_sim.study.names import TABLES
 from iwm_sim.study.plan import (
     FRONTIER_CYCLE,
@@ -52,7 +52,7 @@ def paper_table(
     cycles: Sequence[str] = paper.CYCLES,
     idle_drives: Sequence[str] = IDLE_DRIVES,
     jobs: int = 1,
-    done: Callable[[Result], None] = lambda _: None,
+    quiet: bool = True,
 ) -> list[TableOf]:
     """Drive the cells of a table of the paper, and give it beside the paper's, once for each idle drive.
 
@@ -61,7 +61,8 @@ def paper_table(
     number : key of `TABLES`
     policies : of the car
     cycles, idle_drives : which of its cells
-    jobs, done : see `driving.drive_all`
+    jobs : processes
+    quiet : no progress bar
     """
     wanted: list[Case] = []
     keys = [(idle_drive, friction) for idle_drive in idle_drives for friction in TABLES[number]]
@@ -74,7 +75,8 @@ def paper_table(
                 wanted += [replace(base, label=labels.ED), *gates(base, policies), ours]
             else:
                 wanted += [case for case in cell(base, policies, rules[key].coefficients) if case.label in _SHOWN]
-    rows = rows_of(drive_all(wanted, jobs, done))
+    with Progress(len(wanted), quiet) as progress:
+        rows = rows_of(drive_all(wanted, jobs, progress.update))
     names = [cases.cycle_of(cycle).name for cycle in cycles]
     tables = table_6(rows) if number == "6" else paper_tables(rows, names)
     return [table for table in tables if table.rows]

@@ -222,7 +222,7 @@ def _paper(options: argparse.Namespace) -> None:
     for cycle in cycles:
         cases.cycle_of(cycle)
     policies = Policies(options.vehicle, options.policy, say)
-    tables = single.paper_table(options.paper, policies, cycles, idle_drives, options.jobs)
+    tables = single.paper_table(options.paper, policies, cycles, idle_drives, options.jobs, options.quiet)
     if not options.quiet:
         for table in tables:
             print(f"{table.title or table.section}\n{plain_table(table.rows, table.columns)}\n")
@@ -258,7 +258,7 @@ def _ablation(options: argparse.Namespace) -> None:
     say = silent if options.quiet else tell
     policies = Policies(options.vehicle, options.policy, say)
     with tempfile.TemporaryDirectory(prefix="iwm-ablation-") as folder:
-        rows = ablation.ablation(policies, Path(folder), options.jobs, say)
+        rows = ablation.ablation(policies, Path(folder), options.jobs, say, quiet=options.quiet)
     if not options.quiet:
         print(f"{plain_table(rows, ablation.columns(rows))}\n{ABLATION_NOTE}\n{_policies_text(policies)}")
     if options.json:
