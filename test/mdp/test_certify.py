@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from iwm_power_manager.mdp.certify import bellman_bound, simulated_cost
+from iwm_power_manager.mdp.certify import bellman_bound
 from iwm_power_manager.mdp.policy_iteration import solve
 from oracles.dense_mdp import dense, pack, policy_iteration, random_raw
+from oracles.driven_policy import simulated_cost
 
 
 def _problem(tracked=True, discount=0.9):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from iwm_sim.study import documents
+import documents
 from iwm_sim.study.content import Study
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,7 +67,7 @@ def typed_results(page: str) -> list[str]:
 def test_no_result_is_typed(page: Path, study: Study) -> None:
     allowed = printed() | {f"{value:.2f}" for value in vars(study.paper).values() if isinstance(value, float)}
     typed = [result for result in typed_results(page.read_text(encoding="utf-8")) if result not in allowed]
-    assert not typed, "put them between markers (iwm_sim/study/documents.py)"
+    assert not typed, "put them between markers (scripts/documents.py)"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
