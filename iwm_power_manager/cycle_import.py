@@ -190,9 +190,12 @@ def _in_si(
     time, speed = arrays["time"] - arrays["time"][0], arrays["speed"]
     units = {"time": "s" if time_unit == "clock" else time_unit, "speed": speed_unit}
     for name, names in (("time", _TIME_NAMES), ("speed", _UNIT_NAMES)):
-        if units[name] == "auto" and _named(header[columns[name]], names):
-            units[name] = _named(header[columns[name]], names)
-            said.append(f"{name} in {units[name]}, as the column's name says")
+        named = _named(header[columns[name]], names)
+        if units[name] == "auto" and named:
+            units[name] = named
+            said.append(f"{name} in {named}, as the column's name says")
+        elif named not in ("", units[name]):
+            said.append(f"{name} in {units[name]}, as --{name}-unit says, although the column's name says {named}")
     guess = [name for name in units if units[name] == "auto"]
     if guess:
         known_time = TIME_UNITS.get(units["time"], 1.0) if units["time"] != "auto" else 1.0

@@ -47,6 +47,10 @@ exit codes: 0 written, 2 bad arguments or files, 130 interrupted
 """
 
 
+#: A distance of two samples beyond so many times the usual one is a gap.
+_MISSED = 1.5
+
+
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
     result = command.described("import_cycle", _DESCRIPTION, _EXAMPLES)
@@ -177,6 +181,9 @@ def _text(options: argparse.Namespace, log: Log, numbers: dict[str, Any]) -> str
     for gap in numbers["gaps"]:
         done = {"bridge": "bridged by a straight line", "cut": "cut out"}[options.gaps]
         lines.append(f"gap of {gap['length_s']:.4g} s from {gap['start_s']:.6g} s {done}")
+    short = [length for _, length in log.gaps(_MISSED * log.step_s) if length <= options.max_gap]
+    if short:
+        lines.append(f"{len(short)} gap{'s' * (len(short) > 1)} of up to {max(short):.4g} s bridged (--max-gap)")
     before, after = numbers["traction_wh_per_km_before"], numbers["traction_wh_per_km"]
     effect = f"energy at the wheels of {numbers['vehicle']}: {after:.1f} Wh/km"
     if options.smooth or options.rate:

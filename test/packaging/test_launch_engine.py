@@ -15,7 +15,11 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("launch_ros.actions")
+pytest.importorskip(
+    "launch_ros.actions",
+    reason="no launch_ros, which is no wheel: source a ROS 2 installation and call make test (CI does), or put the "
+    "sources of launch and launch_ros on PYTHONPATH (docs/install.md)",
+)
 
 from launch.actions import (
     DeclareLaunchArgument,

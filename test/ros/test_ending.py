@@ -145,3 +145,29 @@ def test_a_node_that_has_run_leaves_no_dds_to_the_end_of_the_interpreter(compile
         output, _ = process.communicate(timeout=60)
         bench.close()
     assert output == "exit code 0\nleft []\n"
+
+
+#: A node whose middleware never lets go of it.
+HELD_FAST = """
+import ctypes, sys
+import rclpy
+from iwm_power_manager.nodes import power_manager
+rclpy.try_shutdown = lambda *_, **__: ctypes.PyDLL(None).pause()
+sys.exit(power_manager.main())
+"""
+
+
+def test_a_node_that_dds_does_not_let_go_ends_before_launch_loses_patience(compiled_law) -> None:
+    """Launch waits 5 s before it prints errors and sends the next signal."""
+    namespace = f"/held_fast_{os.getpid()}"
+    bench = Bench(int(os.environ["ROS_DOMAIN_ID"]), namespace=namespace)
+    given = arguments({"policy_file": "", "strategy": "equal"}, {"__ns": namespace})
+    process = subprocess.Popen([sys.executable, "-c", HELD_FAST, *given])
+    try:
+        bench.connect()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=5.0) == 0
+    finally:
+        process.kill()
+        process.wait()
+        bench.close()

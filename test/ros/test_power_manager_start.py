@@ -110,6 +110,20 @@ def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, monkeypatch) -> None
     assert not any(cache.rglob("*.law.step-*")), "it went on compiling"
 
 
+def test_services_are_answered_while_it_compiles(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("IWM_CACHE_DIR", str(tmp_path / "cache"))
+    bench = Bench(DOMAIN, namespace="/compiling")
+    running = Running(MODULE, arguments({"strategy": "equal"}, {"__ns": "/compiling"}), DOMAIN, tmp_path)
+    try:
+        assert bench.lifecycle_state() == "unconfigured"
+        assert bench.get_parameter("rate_hz") == 100.0
+        assert not any((tmp_path / "cache").rglob("*.law.step-*")), "it has compiled already"
+    finally:
+        running.process.kill()
+        running.wait()
+        bench.close()
+
+
 #: A start that fails because a library makes something else of the KeyboardInterrupt, as a ctypes callback does.
 SWALLOWED = """
 import signal, sys

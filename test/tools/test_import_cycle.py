@@ -78,6 +78,15 @@ def test_a_gap_is_bridged_or_cut_by_choice_and_never_in_silence(tmp_path, capsys
     code, out, _ = run(capsys, log, "--output", output, "--gaps", "cut")
     assert "cut out" in out
     assert NYCC.duration_s - 52 < load_cycle(output).duration_s < NYCC.duration_s - 40
+    code, out, _ = run(capsys, log, "--output", output, "--max-gap", "60")
+    assert "1 gap of up to 52 s bridged (--max-gap)" in out
+
+
+def test_a_unit_that_overrules_the_columns_name_is_said(tmp_path, capsys):
+    log = log_of(tmp_path / "log.csv", ("time_s", "v [km/h]"), zip(NYCC.time_s, NYCC.speed_mps, strict=True))
+    code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv", "--speed-unit", "m/s")
+    assert code == 0
+    assert "speed in m/s, as --speed-unit says, although the column's name says km/h" in out
 
 
 def test_smoothing_takes_noise_away_and_says_what_it_does_to_the_energy(tmp_path, capsys):
