@@ -39,7 +39,7 @@ roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside w
 docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (2 min)
 	@$(BIN)/python scripts/docs_numbers $(ARGS)
 
-bench: setup-dev  ## Time control path, bags, solver and closed loop on this machine, each beside a peer
+bench: setup-dev  ## Time control path, bags, solver and closed loop on this machine, each beside a peer (an hour)
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit $$?; done
 
 ##@ Documentation
@@ -47,13 +47,13 @@ bench: setup-dev  ## Time control path, bags, solver and closed loop on this mac
 docs: setup-dev  ## The pages, every --help and the API as a site: build/docs/html/index.html (2 min)
 	@$(BIN)/python scripts/docs_site $(ARGS)
 
-bench-peers: setup-dev  ## FASTSim in an environment of its own, runs/peers: a peer of benchmarks/performance.py
+bench-peers: setup-dev  ## FASTSim in an environment of its own, runs/peers: a peer of benchmarks/performance.py (1 min)
 	@test -x runs/peers/bin/python || $(BIN)/python -m venv runs/peers
 	@runs/peers/bin/python -m pip install --quiet --require-hashes -r benchmarks/requirements.txt
 
 ##@ Safety
 .PHONY: faults soak nightly coverage mutation
-faults: setup-run  ## Fault campaign over DDS with the simulator in the loop
+faults: setup-run  ## Fault campaign over DDS with the simulator in the loop (7 min)
 	@$(BIN)/python -m campaigns.faults $(ARGS)
 
 soak: setup-dev  ## 30 minutes in real time at 100 Hz: memory, deadlines, counts
@@ -64,24 +64,24 @@ nightly: setup-dev  ## The tests that are too long for every run, and far more r
 
 # Compiled kernels leave no trace, so the safety code is covered as plain Python.
 SAFETY := iwm_power_manager/model/gate.py,iwm_power_manager/model/limits.py,iwm_power_manager/model/torque.py,iwm_power_manager/control/*
-coverage: setup-dev  ## Line and branch coverage of control law, limits, gating and input checks: 100 %
+coverage: setup-dev  ## Line and branch coverage of control law, limits, gating and input checks: 100 % (15 min)
 	@$(BIN)/coverage erase
 	@NUMBA_DISABLE_JIT=1 $(BIN)/coverage run -m pytest test/model test/control $(PYTEST_ARGS)
 	@$(BIN)/coverage combine --quiet
 	@$(BIN)/coverage report --include='$(SAFETY)' --fail-under=100
 
-mutation: setup-dev  ## Mutate the same modules: do the tests notice?
+mutation: setup-dev  ## Mutate the same modules: do the tests notice? (an hour; ARGS="--sample 250": minutes)
 	@$(BIN)/python scripts/mutation $(ARGS)
 
 ##@ Parts
 .PHONY: setup lint type format sbom build clean setup-run setup-dev help
 setup: setup-dev  ## Only set up: .venv with everything that demo, tests, docs and watch_car need (3 min)
 
-lint: setup-dev  ## ruff: style, docstrings, likely mistakes; import-linter: the layers
+lint: setup-dev  ## ruff: style, docstrings, likely mistakes; import-linter: the layers (1 min)
 	@$(BIN)/ruff check .
 	@$(BIN)/lint-imports --no-logo 2> /dev/null || $(BIN)/lint-imports
 
-type: setup-dev  ## mypy, strict
+type: setup-dev  ## mypy, strict (1 min)
 	@$(BIN)/mypy
 
 format: setup-dev  ## Reformat the sources

@@ -208,7 +208,7 @@ def _draw(path: Path, found: MotorMap, reach: Reach) -> None:
         levels = np.linspace(max(float(shown.min()), 0.3), min(float(shown.max()) + 0.01, 1.0), 12)
         if levels[-1] > levels[0]:
             picture = axes.contourf(speed, torque, shown, levels, cmap="viridis", extend="min")
-            figure.colorbar(picture, label="efficiency")
+            figure.colorbar(picture, label="efficiency", format="%.2f")
     known = ~np.isnan(found.loss_w)
     axes.plot(speed[known], torque[known], ".", color="black", markersize=2, label="points with a loss")
     line = np.linspace(0.0, max(reach.top_speed_radps, 1e-3), 200)
