@@ -32,6 +32,7 @@ ROSDEP_KEYS = {
     "bokeh": "python3-bokeh-pip",
     "jinja2": "python3-jinja2",
     "apsw": "python3-rosbags-pip",
+    "llvmlite": "python3-numba",
     "lz4": "python3-rosbags-pip",
     "matplotlib": "python3-matplotlib",
     "mcap": "mcap-ros2-support",
@@ -46,8 +47,8 @@ ROSDEP_KEYS = {
 }
 #: Used where they are installed; without them, one line says what to install.
 OPTIONAL = {"dask", "distributed", "pandas", "pyarrow"}
-#: What pip calls a module of another name.
-DISTRIBUTIONS = {"PIL": "pillow", "yaml": "pyyaml"}
+#: What pip calls a module of another name, or what brings it: of llvmlite numba demands a version of its own.
+DISTRIBUTIONS = {"PIL": "pillow", "llvmlite": "numba", "yaml": "pyyaml"}
 
 #: Parts that know numbers and files only: usable, and tested, where no ROS is.
 ROS_FREE = [
