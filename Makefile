@@ -33,8 +33,8 @@ study: setup-run  ## All tables and figures of the paper, and what beats them (1
 unseen: setup-run  ## Our strategy on cycles and cars that were not there when it was made (says how long)
 	@$(BIN)/evaluate --unseen runs/unseen $(ARGS)
 
-roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required (1 min)
-	@$(BIN)/python -m iwm_sim.tools.roads --page docs/roads.md $(ARGS)
+roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required (4 min)
+	@$(BIN)/python -m iwm_sim.tools.roads --unknown --page docs/roads.md $(ARGS)
 
 docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (2 min)
 	@$(BIN)/python scripts/docs_numbers $(ARGS)

@@ -81,6 +81,8 @@ FASTEST_BRAKED = 1.12
 #: that are less than this part apart are no two roads.
 UNEQUAL_S = 0.03
 UNEQUAL_PART = 0.2
+#: The yaw budget grows with one over the square of the speed, up to the square of this.
+MOST_YAW_SPEED = 2.0
 
 #: Below this speed, m/s, the car counts as standing: it is what wheels and car must both exceed to be rolling.
 MOVING_MPS = 0.06
@@ -226,25 +228,44 @@ def _room_nm(wheel: Wheel) -> float:
 
 
 @kernel
-def _rooms_nm(left: Wheel, right: Wheel, moment_nm: float, axle: Axle) -> tuple[float, float]:
-    """Room of an axle's two wheels within its yaw budget.
+def _rooms_nm(left: Wheel, right: Wheel, moments_nm: tuple[float, float], axle: Axle) -> tuple[float, float]:
+    """Room of an axle's two wheels within its yaw budget: the moments that more torque left, and right, may have.
 
     The moment of a difference of torques T is T / radius * track / 2.
     """
-    left_room = _room_nm(left)
-    right_room = _room_nm(right)
-    difference = moment_nm * 2.0 * axle.wheel.radius_m / axle.track_width_m
-    most = min(left_room, right_room) + difference
-    return min(left_room, most), min(right_room, most)
+    left_room, right_room = _room_nm(left), _room_nm(right)
+    per_moment = 2.0 * axle.wheel.radius_m / axle.track_width_m
+    left_more, right_more = per_moment * moments_nm[0], per_moment * moments_nm[1]
+    return min(left_room, right_room + left_more), min(right_room, left_room + right_more)
 
 
 @kernel
-def _unequal_s(before_s: float, left: Wheel, right: Wheel, unequal: bool, short: bool, dt_s: float) -> float:
-    """How long an axle's torques have been unequal by more than noise, or would have been without a yaw budget."""
+def _unequal_s(before_s: float, left: Wheel, right: Wheel, wanted: bool, dt_s: float) -> float:
+    """How long an axle has braked unequally, or would have without a yaw budget: > 0 more left, < 0 more right.
+
+    What was steered for one side is nothing for the other: the time goes back through zero.
+    """
     left_room, right_room = _room_nm(left), _room_nm(right)
-    apart = abs(left_room - right_room) > UNEQUAL_PART * max(left_room, right_room)
-    wanted = apart and (unequal or short)
-    return before_s + dt_s if wanted else max(before_s - dt_s, 0.0)
+    if wanted and abs(left_room - right_room) > UNEQUAL_PART * max(left_room, right_room):
+        return before_s + dt_s if left_room > right_room else before_s - dt_s
+    left_over = max(abs(before_s) - dt_s, 0.0)
+    return left_over if before_s > 0.0 else -left_over
+
+
+@kernel
+def _slip_targets(unequal_s: float, braking: bool, settings: Settings) -> Wheels:
+    """Slip the limiter holds each wheel at.
+
+    Unequal torques of the front wheels have to be steered against, with the front wheel that grips; and they turn the
+    car, which the rear wheels keep straight: both need to keep something of their grip for that.
+    """
+    most = settings.slip_target
+    if not braking or abs(unequal_s) <= UNEQUAL_S:
+        return (most, most, most, most)
+    high = min(most, settings.unequal_slip_target)
+    low = min(most, settings.unequal_low_slip_target)
+    rear = min(most, settings.unequal_rear_slip_target)
+    return (high, low, rear, rear) if unequal_s > 0.0 else (low, high, rear, rear)
 
 
 @kernel
@@ -360,52 +381,70 @@ class Shared(NamedTuple):
 
 
 @kernel
-def _yaw_moment_nm(now_nm: float, growth_nmps: float, most_nm: float, unequal_s: float, braking: bool) -> float:
-    """Yaw moment an axle's unequal torques may have.
+def _yaw_moments_nm(
+    now_nm: float,
+    growth_nmps: float,
+    most_nm: float,
+    unequal_s: float,
+    speed_mps: float,
+    braking: bool,
+    settings: Settings,
+) -> tuple[float, float]:
+    """Yaw moments that more torque left, and more torque right, may have.
 
-    Motors pull far less than brakes, and most at low speed: driving, all of it is there at once.
+    How far a moment takes the car aside until it is steered against goes with the square of the speed. Motors pull far
+    less than brakes, and most at low speed: driving, all of it is there at once.
     """
-    return min(now_nm + growth_nmps * unequal_s, most_nm) if braking else most_nm
+    if not braking:
+        return most_nm, most_nm
+    part = min(settings.yaw_speed_mps / max(speed_mps, MOVING_MPS), MOST_YAW_SPEED)
+    now, growth = part * part * now_nm, part * part * growth_nmps
+    return min(now + growth * max(unequal_s, 0.0), most_nm), min(now + growth * max(-unequal_s, 0.0), most_nm)
+
+
+@kernel
+def _alike(k: int, measurement: Measurement, before: FourWheels, targets: Wheels) -> bool:
+    """Whether the wheels `k` and `k + 1` have all in common, so that what is worked out for one holds for both."""
+    m = measurement
+    w, gain, stuck = m.wheel_speed_radps, m.motor_gain, m.motor_stuck_nm
+    same = w[k] == w[k + 1] and gain[k] == gain[k + 1] and stuck[k] == stuck[k + 1]
+    return same and before[k] == before[k + 1] and targets[k] == targets[k + 1]
 
 
 @kernel
 def _pair(
+    k: int,
     measurement: Measurement,
-    left_radps: float,
-    right_radps: float,
-    left_slip: float,
-    right_slip: float,
+    slips: Wheels,
     speed_mps: float,
-    left_gain: float,
-    right_gain: float,
     lower_part: float,
     gate_mode: int,
-    slip_target: float,
-    moment_nm: float,
+    targets: Wheels,
+    moments_nm: tuple[float, float],
     first: bool,
-    left_before: WheelState,
-    right_before: WheelState,
+    before: FourWheels,
     alike: bool,
     axle: Axle,
     settings: Settings,
     vehicle: VehicleParams,
 ) -> Pair:
-    """Steps 3 and 4 for an axle."""
-    demand, dt = measurement.power_demand_w, measurement.dt_s
-    left_gate, right_gate = left_slip, right_slip
+    """Steps 3 and 4 for the axle whose wheels are `k` and `k + 1`."""
+    m = measurement
+    w, gain, demand, dt = m.wheel_speed_radps, m.motor_gain, m.power_demand_w, m.dt_s
+    left_gate, right_gate = slips[k], slips[k + 1]
     if gate_mode == GATE_MODE_TABLE2:
-        left_gate = right_gate = worse_slip(left_slip, right_slip)
+        left_gate = right_gate = worse_slip(slips[k], slips[k + 1])
     left = _wheel(
-        left_radps, left_slip, left_gate, speed_mps, demand, left_gain, lower_part, gate_mode, slip_target, dt, first,
-        left_before, right_radps, right_before, axle, settings, vehicle,
+        w[k], slips[k], left_gate, speed_mps, demand, gain[k], lower_part, gate_mode, targets[k], dt, first,
+        before[k], w[k + 1], before[k + 1], axle, settings, vehicle,
     )  # fmt: skip
     right = left
     if not alike:
         right = _wheel(
-            right_radps, right_slip, right_gate, speed_mps, demand, right_gain, lower_part, gate_mode, slip_target, dt,
-            first, right_before, left_radps, left_before, axle, settings, vehicle,
+            w[k + 1], slips[k + 1], right_gate, speed_mps, demand, gain[k + 1], lower_part, gate_mode, targets[k + 1],
+            dt, first, before[k + 1], w[k], before[k], axle, settings, vehicle,
         )  # fmt: skip
-    left_room, right_room = _rooms_nm(left, right, moment_nm, axle)
+    left_room, right_room = _rooms_nm(left, right, moments_nm, axle)
     return Pair(left, right, left_room, right_room, alike)
 
 
@@ -470,21 +509,24 @@ def drive(
     slip_control : gate and slip limiter may act
     lower_part : a power that brakes is divided by this part of the speed (`motion.Motion`)
     """
-    fl0, fr0, rl0, rr0 = state.wheels
     speed = max(measurement.speed_mps, 0.0)
     dt = measurement.dt_s
     braking = measurement.power_demand_w < 0.0
     first = state.steps == 0
+    before = state.wheels
+
+    s = settings
+    front_s, rear_s = state.front_unequal_s, state.rear_unequal_s
+    targets = _slip_targets(front_s, braking, s)
+    front_alike = _alike(0, measurement, before, targets)
+    rear_alike = _alike(2, measurement, before, targets)
 
     # 1. slip, wheel by wheel; an axle's is that of its worse wheel
     w = measurement.wheel_speed_radps
-    gain, stuck = measurement.motor_gain, measurement.motor_stuck_nm
-    front_alike = w[0] == w[1] and fl0 == fr0 and gain[0] == gain[1] and stuck[0] == stuck[1]
-    rear_alike = w[2] == w[3] and rl0 == rr0 and gain[2] == gain[3] and stuck[2] == stuck[3]
-    fl_slip = _slip(w[0], speed, dt, first, fl0, vehicle.front, settings)
-    fr_slip = fl_slip if front_alike else _slip(w[1], speed, dt, first, fr0, vehicle.front, settings)
-    rl_slip = _slip(w[2], speed, dt, first, rl0, vehicle.rear, settings)
-    rr_slip = rl_slip if rear_alike else _slip(w[3], speed, dt, first, rr0, vehicle.rear, settings)
+    fl_slip = _slip(w[0], speed, dt, first, before[0], vehicle.front, settings)
+    fr_slip = fl_slip if front_alike else _slip(w[1], speed, dt, first, before[1], vehicle.front, settings)
+    rl_slip = _slip(w[2], speed, dt, first, before[2], vehicle.rear, settings)
+    rr_slip = rl_slip if rear_alike else _slip(w[3], speed, dt, first, before[3], vehicle.rear, settings)
     front_slip = worse_slip(fl_slip, fr_slip)
     rear_slip = worse_slip(rl_slip, rr_slip)
 
@@ -493,21 +535,16 @@ def drive(
 
     # 3. gate, 4. capacity
     mode = settings.gate_mode if slip_control else GATE_MODE_OFF
-    # Unequal torques of the front wheels have to be steered against: the tyres must keep something to steer with.
-    unequal = braking and state.front_unequal_s > UNEQUAL_S
-    target = min(settings.slip_target, settings.unequal_slip_target) if unequal else settings.slip_target
-    s = settings
-    front_yaw = _yaw_moment_nm(
-        s.front_yaw_nm, s.front_yaw_growth_nmps, s.front_yaw_most_nm, state.front_unequal_s, braking
-    )
-    rear_yaw = _yaw_moment_nm(s.rear_yaw_nm, s.rear_yaw_growth_nmps, s.rear_yaw_most_nm, state.rear_unequal_s, braking)
+    slips = (fl_slip, fr_slip, rl_slip, rr_slip)
+    front_nm = _yaw_moments_nm(s.front_yaw_nm, s.front_yaw_growth_nmps, s.front_yaw_most_nm, front_s, speed, braking, s)
+    rear_nm = _yaw_moments_nm(s.rear_yaw_nm, s.rear_yaw_growth_nmps, s.rear_yaw_most_nm, rear_s, speed, braking, s)
     front = _pair(
-        measurement, w[0], w[1], fl_slip, fr_slip, speed, gain[0], gain[1], lower_part, mode, target, front_yaw, first,
-        fl0, fr0, front_alike, vehicle.front, settings, vehicle,
+        0, measurement, slips, speed, lower_part, mode, targets, front_nm, first, before, front_alike, vehicle.front, s,
+        vehicle,
     )  # fmt: skip
     rear = _pair(
-        measurement, w[2], w[3], rl_slip, rr_slip, speed, gain[2], gain[3], lower_part, mode, target, rear_yaw, first,
-        rl0, rr0, rear_alike, vehicle.rear, settings, vehicle,
+        2, measurement, slips, speed, lower_part, mode, targets, rear_nm, first, before, rear_alike, vehicle.rear, s,
+        vehicle,
     )  # fmt: skip
     return _commanded(measurement, speed, front, rear, front_slip, rear_slip, memory, state, settings, vehicle)
 
@@ -620,12 +657,14 @@ def _commanded(
         left_confidence=0.0,
         right_confidence=0.0,
     )
+    front_apart = braking and (fl_nm != fr_nm or front_short)
+    rear_apart = braking and (rl_nm != rr_nm or rear_short)
     after = ControllerState(
         steps=state.steps + 1,
         split=memory,
         wheels=_wheels_after(front, rear, motor, (fl_nm, fr_nm, rl_nm, rr_nm), state.wheels, dt, vehicle),
-        front_unequal_s=_unequal_s(state.front_unequal_s, front.left, front.right, fl_nm != fr_nm, front_short, dt),
-        rear_unequal_s=_unequal_s(state.rear_unequal_s, rear.left, rear.right, rl_nm != rr_nm, rear_short, dt),
+        front_unequal_s=_unequal_s(state.front_unequal_s, front.left, front.right, front_apart, dt),
+        rear_unequal_s=_unequal_s(state.rear_unequal_s, rear.left, rear.right, rear_apart, dt),
         motion=state.motion,
         travel=state.travel,
         hold_nm=state.hold_nm,

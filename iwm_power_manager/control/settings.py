@@ -95,8 +95,17 @@ class Settings(NamedTuple):
     slip_target: Annotated[float, Setting("slip the limiter holds, below critical_slip", "", 0.01, 0.9)] = 0.16
     # Two thirds of the peak friction, and as much to steer with.
     unequal_slip_target: Annotated[
-        float, Setting("slip the limiter holds while left and right are at unequal torques", "", 0.01, 0.9)
+        float,
+        Setting(
+            "slip the limiter holds, while left and right brake unequally, on the side with more grip", "", 0.01, 0.9
+        ),
     ] = 0.06
+    # Nearly all the braking, and half as much to steer with again as at slip_target.
+    unequal_low_slip_target: Annotated[
+        float, Setting("the same on the other side of the front axle", "", 0.01, 0.9)
+    ] = 0.1
+    # Nine tenths of the stiffness across: with less, a car on a split road turns round at high speed.
+    unequal_rear_slip_target: Annotated[float, Setting("the same on both rear wheels", "", 0.01, 0.9)] = 0.03
     # Stops within 5 % of the shortest way at every friction; faster shakes the car more.
     slip_limiter_s: Annotated[float, Setting("time constant of the slip limiter", "s", 0.001, 1.0)] = 0.025
     slip_filter_s: Annotated[
@@ -109,6 +118,12 @@ class Settings(NamedTuple):
     front_yaw_nm: Annotated[
         float, Setting("yaw moment that unequal torques of the front wheels may have at once", "N m", 0.0, 1e5)
     ] = 50.0
+    yaw_speed_mps: Annotated[
+        float,
+        Setting(
+            "speed at which the yaw budgets are what they say; they go with one over its square", "m/s", 1.0, 100.0
+        ),
+    ] = 20.0
     front_yaw_growth_nmps: Annotated[float, Setting("growth of it while it is used", "N m/s", 0.0, 1e6)] = 150.0
     front_yaw_most_nm: Annotated[float, Setting("what it grows to", "N m", 0.0, 1e5)] = 600.0
     # The rear wheels keep the car straight: both get what the one with less grip can take (select-low).

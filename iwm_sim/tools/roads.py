@@ -7,6 +7,7 @@ Exit codes: 0 every requirement is met; 1 one is not; 2 bad arguments or files; 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,9 +18,10 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.command import ended, write_json
-from iwm_sim.road_report import page, text
+from iwm_sim.road_report import page, text, unknown
 from iwm_sim.road_run import RoadResult, check_scenario
-from iwm_sim.scenario import FOLDER, load_scenario
+from iwm_sim.scenario import DEFAULT_VEHICLE, FOLDER, load_scenario
+from iwm_sim.unknown_friction import all_cells, all_jumped, differs, savings
 
 DONE, FAILED = 0, 1
 
@@ -31,6 +33,8 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument("scenario", nargs="*", help="files, or names of config/scenarios (default: all of them)")
     result.add_argument("--strategy", choices=list(drivable()), default=DEFAULT_STRATEGY, help="(default: %(default)s)")
+    result.add_argument("--unknown", action="store_true", help="also what it costs not to know the friction (3 min)")
+    result.add_argument("--policy", default="policies", metavar="DIR", help="with --unknown (default: %(default)s)")
     result.add_argument("--page", type=Path, metavar="MD", help="write the table as a page")
     result.add_argument("--json", type=Path, metavar="FILE", help="write the values as JSON")
     return result
@@ -52,11 +56,19 @@ def _drive(options: argparse.Namespace) -> int:
         print(text(results[-1]), flush=True)
     passed = sum(result.passed for result in results)
     print(f"{passed} of {len(results)} scenarios meet all they require")
+    whole = passed == len(results)
+    written = page(results, options.strategy)
+    if options.unknown:
+        jobs = os.cpu_count() or 1
+        cells, jumps = savings(all_cells(), jobs, DEFAULT_VEHICLE, options.policy), all_jumped(jobs)
+        whole = whole and not any(map(differs, cells)) and all(jump.no_worse for jump in jumps)
+        written += unknown(cells, jumps)
+        print(unknown(cells, jumps), flush=True)
     if options.page:
-        atomic_write(options.page, page(results, options.strategy).encode())
+        atomic_write(options.page, written.encode())
     if options.json:
         write_json(options.json, {result.scenario.name: result.values for result in results})
-    return DONE if passed == len(results) else FAILED
+    return DONE if whole else FAILED
 
 
 if __name__ == "__main__":

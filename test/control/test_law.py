@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from typing import Any, NamedTuple
 
 import pytest
@@ -105,8 +106,8 @@ class Case(NamedTuple):
         return max(wheel, held, self.car.driver.power_speed_floor_mps / radius)
 
     @property
-    def slip_target(self):
-        return oracle.slip_target(self.before, self.settings, self.braking)
+    def slip_targets(self):
+        return oracle.slip_targets(self.before, self.settings, self.braking)
 
     def fast(self, i):
         return max(self.m.wheel_speed_radps[i], self.conversion(i))
@@ -121,8 +122,8 @@ class Case(NamedTuple):
             return math.inf
         wheel = self.m.wheel_speed_radps[i]
         road = self.after.wheels[i].road_nm
-        tuned = self.settings._replace(slip_target=self.slip_target)
-        return oracle.grip(self.braking, road, wheel, self.m.speed_mps, tuned, self.axle(i))
+        target = self.slip_targets[i]
+        return oracle.grip(self.braking, road, wheel, self.m.speed_mps, target, self.settings, self.axle(i))
 
     def battery_w(self, factor=1.0):
         return sum(
@@ -205,6 +206,9 @@ TUNINGS = st.builds(
     front_yaw_most_nm=st.sampled_from((500.0, 1e5)),
     rear_yaw_most_nm=st.sampled_from((0.0, 400.0)),
     unequal_slip_target=st.sampled_from((0.06, 0.3)),
+    unequal_low_slip_target=st.sampled_from((0.1, 0.05)),
+    unequal_rear_slip_target=st.sampled_from((0.03, 0.2)),
+    yaw_speed_mps=st.sampled_from((20.0, 5.0)),
     slew_up_nmps=st.sampled_from((1600.0, 300.0)),
     slew_down_nmps=st.sampled_from((20000.0, 900.0)),
     slew_regeneration_nmps=st.sampled_from((4000.0, 500.0)),
@@ -243,8 +247,8 @@ MEMORIES = st.builds(
         jitter=st.just(no_jitter()),
     ),
     wheels=FOUR_STATES,
-    front_unequal_s=AGES,
-    rear_unequal_s=AGES,
+    front_unequal_s=st.one_of(AGES, AGES.map(operator.neg)),
+    rear_unequal_s=st.one_of(AGES, AGES.map(operator.neg)),
     motion=st.just(initial_state().motion),
     travel=st.just(1.0),
     hold_nm=st.just(0.0),
@@ -297,15 +301,13 @@ def the_yaw_budget_of_an_axle_is_kept(case):
     # What the motors' slew and the battery do about it is short; what is asked of motor and brake together is not.
     if not case.braking or case.command.limits & (t.LIMIT_SLEW | t.LIMIT_FRICTION_BRAKE):
         return
-    s, b = case.settings, case.before
     total = [motor + brake for _, motor, brake, *_ in case.wheels()]
-    for k, budget in (
-        (0, min(s.front_yaw_nm + s.front_yaw_growth_nmps * b.front_unequal_s, s.front_yaw_most_nm)),
-        (2, min(s.rear_yaw_nm + s.rear_yaw_growth_nmps * b.rear_unequal_s, s.rear_yaw_most_nm)),
-    ):
+    for k, name in ((0, "front"), (2, "rear")):
         axle = case.axle(k)
-        moment = abs(total[k] - total[k + 1]) / axle.wheel.radius_m * 0.5 * axle.track_width_m
-        assert moment <= budget * (1.0 + 1e-9) + 1e-6
+        left_more = abs(total[k]) - abs(total[k + 1])
+        budget = oracle.yaw_budget(name, case.before, case.settings, case.m.speed_mps, case.braking)
+        moment = abs(left_more) / axle.wheel.radius_m * 0.5 * axle.track_width_m
+        assert moment <= budget[0 if left_more > 0.0 else 1] * (1.0 + 1e-9) + 1e-6
 
 
 def alike_on_both_sides_is_commanded_alike(case):
@@ -321,7 +323,11 @@ def mirrored(case):
     order = (1, 0, 3, 2)
     return (
         case.m._replace(wheel_speed_radps=tuple(case.m.wheel_speed_radps[i] for i in order)),
-        case.before._replace(wheels=tuple(case.before.wheels[i] for i in order)),
+        case.before._replace(
+            wheels=tuple(case.before.wheels[i] for i in order),
+            front_unequal_s=-case.before.front_unequal_s,
+            rear_unequal_s=-case.before.rear_unequal_s,
+        ),
     )
 
 
@@ -332,6 +338,8 @@ def left_and_right_exchanged_exchange_the_command(case):
         (case.command.friction_torque_nm, command.friction_torque_nm),
         ([w.heat for w in case.after.wheels], [w.heat for w in after.wheels]),
         ([w.road_nm for w in case.after.wheels], [w.road_nm for w in after.wheels]),
+        ([case.after.front_unequal_s] * 4, [-after.front_unequal_s] * 4),
+        ([case.after.rear_unequal_s] * 4, [-after.rear_unequal_s] * 4),
     ):
         near = pytest.approx([other[i] for i in (1, 0, 3, 2)], rel=1e-9, abs=1e-6)
         assert list(ours) == near or case.command.limits & (t.LIMIT_BATTERY_CHARGE | t.LIMIT_BATTERY_DISCHARGE)
@@ -472,7 +480,8 @@ def it_does_what_the_plain_law_does(case):
 
     for name in ("front", "rear"):
         was, now = (getattr(state, f"{name}_unequal_s") for state in (case.before, after))
-        assert now in (near(was + case.m.dt_s), near(max(was - case.m.dt_s, 0.0)))
+        back = math.copysign(max(abs(was) - case.m.dt_s, 0.0), was)
+        assert now == near(back) or (case.braking and now in (near(was + case.m.dt_s), near(was - case.m.dt_s)))
     ours = [(motor, brake) for _, motor, brake, *_ in case.wheels()]
     assert ours == [(near(a.motor), near(a.friction)) for a in wheels]
     assert [state.gated for state in after.wheels] == [a.gated for a in wheels]
@@ -964,25 +973,60 @@ def test_a_held_car_that_moves_off_is_let_go():
     assert command.friction_torque_nm == (0.0,) * 4
 
 
-def test_the_yaw_budget_grows_while_it_is_used_and_goes_back_after():
+def braked_unequally(slow, steps, state=None):
+    """Braking at 15 m/s with one front wheel slower than the others; what the left one has more, step by step."""
     rolling = 15.0 / RADIUS
-    split = measurement(demand=-40e3, wheel_speed_radps=(0.83 * rolling, rolling, rolling, rolling))
-    state = settle(measurement(demand=-40e3)).after
-    assert state.front_unequal_s == 0.0
-    differences = []
-    for _ in range(20):
-        case = take(split, state)
+    wheels = tuple(0.83 * rolling if i == slow else rolling for i in range(4))
+    state = state or settle(measurement(demand=-40e3)).after
+    more = []
+    for _ in range(steps):
+        case = take(measurement(demand=-40e3, wheel_speed_radps=wheels), state)
         state = case.after
         total = [motor + brake for _, motor, brake, *_ in case.wheels()]
-        differences.append(total[0] - total[1])
-    assert state.front_unequal_s == pytest.approx(0.2)
+        more.append(total[1] - total[0])
+    return more, state
+
+
+@pytest.mark.parametrize(("slow", "side"), [(0, -1.0), (1, 1.0)])
+def test_the_yaw_budget_grows_while_it_is_used_and_goes_back_after(slow, side):
+    more, state = braked_unequally(slow, 20)
+    assert state.front_unequal_s == pytest.approx(side * 0.2)
     assert state.rear_unequal_s == 0.0
-    per_s = DEFAULT.front_yaw_growth_nmps * 2.0 * RADIUS / CAR.front.track_width_m
-    assert differences[0] == pytest.approx(DEFAULT.front_yaw_nm * 2.0 * RADIUS / CAR.front.track_width_m)
-    assert differences[15] - differences[10] == pytest.approx(0.05 * per_s)
+    per_nm = (DEFAULT.yaw_speed_mps / 15.0) ** 2 * 2.0 * RADIUS / CAR.front.track_width_m
+    assert more[0] == pytest.approx(side * DEFAULT.front_yaw_nm * per_nm)
+    assert more[15] - more[10] == pytest.approx(side * 0.05 * DEFAULT.front_yaw_growth_nmps * per_nm)
     for _ in range(20):
         state = take(measurement(demand=-1000.0), state).after
     assert state.front_unequal_s == pytest.approx(0.0, abs=1e-9)
+
+
+def test_what_one_side_has_grown_to_is_no_budget_of_the_other():
+    more, state = braked_unequally(0, 40)
+    assert more[-1] < 1.5 * more[0] < 0.0
+    other, state = braked_unequally(1, 10, state)
+    assert max(other) <= -more[0] * (1.0 + 1e-9)
+    assert state.front_unequal_s == pytest.approx(-0.3)
+
+
+def test_the_yaw_budget_is_smaller_the_faster_the_car():
+    slow, fast = (settle(measurement(demand=-40e3, speed=speed)).after for speed in (15.0, 30.0))
+    differences = []
+    for speed, state in ((15.0, slow), (30.0, fast)):
+        rolling = speed / RADIUS
+        wheels = (0.83 * rolling, rolling, rolling, rolling)
+        case = take(measurement(demand=-80e3, speed=speed, wheel_speed_radps=wheels), state)
+        total = [motor + brake for _, motor, brake, *_ in case.wheels()]
+        differences.append(total[0] - total[1])
+    assert differences[0] == pytest.approx(4.0 * differences[1])
+
+
+def test_driving_unequally_gives_the_brakes_no_budget():
+    rolling = 15.0 / RADIUS
+    state = settle(measurement(demand=8e3)).after
+    for _ in range(10):
+        split = measurement(demand=8e3, wheel_speed_radps=(1.3 * rolling, rolling, rolling, rolling))
+        state = take(split, state).after
+    assert state.front_unequal_s == 0.0
 
 
 def test_below_walking_pace_no_brake_is_gated():

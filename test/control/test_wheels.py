@@ -168,11 +168,15 @@ def test_a_car_that_turns_round_remembers_each_wheel_as_itself(wheel):
 
 
 @WHEELS
-def test_each_axle_remembers_how_long_its_own_wheels_were_unequal(wheel):
-    before = remembered()._replace(front_unequal_s=0.5, rear_unequal_s=0.2)
-    _, after = step(measured(12e3, gain=one(wheel, 0.0, (1.0,) * 4)), before)
-    assert after.front_unequal_s == pytest.approx(0.51 if wheel < 2 else 0.49)
-    assert after.rear_unequal_s == pytest.approx(0.21 if wheel >= 2 else 0.19)
+@pytest.mark.parametrize("demand", [-12e3, 12e3])
+def test_each_axle_remembers_how_long_its_own_wheels_braked_unequally(wheel, demand):
+    wheels = one(wheel, 0.75 * rolling()[wheel], rolling())
+    before = remembered(speed_radps=wheels)._replace(front_unequal_s=0.5, rear_unequal_s=-0.2)
+    _, after = step(measured(demand, wheels), before)
+    more = 0.01 if wheel % 2 else -0.01
+    braked = demand < 0.0
+    assert after.front_unequal_s == pytest.approx(0.5 + (more if braked and wheel < 2 else -0.01))
+    assert after.rear_unequal_s == pytest.approx(-0.2 + (more if braked and wheel >= 2 else 0.01))
 
 
 def test_each_axle_has_its_own_brakes_motors_and_radius():

@@ -34,23 +34,37 @@ def slewed(before, target, dt, up, down, regeneration):
     return value
 
 
-def grip(braking, road, wheel, speed, settings, axle):
+def grip(braking, road, wheel, speed, target, settings, axle):
     """Torque that brings a wheel to the target slip within the limiter's time, against what the road takes."""
     if braking and speed < settings.slip_speed_floor_mps:
         return math.inf
     if braking:
-        rim = max(min(speed * (1.0 - settings.slip_target), speed - LEAST_SLIP_SPEED), 0.0)
+        rim = max(min(speed * (1.0 - target), speed - LEAST_SLIP_SPEED), 0.0)
     else:
-        rim = max(speed / (1.0 - settings.slip_target), speed + LEAST_SLIP_SPEED)
+        rim = max(speed / (1.0 - target), speed + LEAST_SLIP_SPEED)
     change = (rim / axle.wheel.radius_m - wheel) / settings.slip_limiter_s
     torque = road + axle.wheel.inertia_kgm2 * change
     return max(-torque if braking else torque, 0.0)
 
 
-def slip_target(state, settings, braking):
-    """Slip the limiter steers to: less while left and right are braked unequally."""
-    unequal = braking and state.front_unequal_s > 0.03
-    return min(settings.slip_target, settings.unequal_slip_target) if unequal else settings.slip_target
+def slip_targets(state, settings, braking):
+    """Slip the limiter steers each wheel to: less while left and right are braked unequally."""
+    unequal = state.front_unequal_s
+    if not braking or -0.03 <= unequal <= 0.03:
+        return [settings.slip_target] * 4
+    front = [settings.unequal_slip_target, settings.unequal_low_slip_target]
+    front = front if unequal > 0.0 else front[::-1]
+    return [min(target, settings.slip_target) for target in (*front, *[settings.unequal_rear_slip_target] * 2)]
+
+
+def yaw_budget(name, state, settings, speed, braking):
+    """Yaw moment that more torque left may have, and more torque right."""
+    now, growth, most = (getattr(settings, f"{name}_yaw_{part}") for part in ("nm", "growth_nmps", "most_nm"))
+    if not braking:
+        return [most, most]
+    factor = min(settings.yaw_speed_mps / max(speed, 0.06), 2.0) ** 2
+    unequal = getattr(state, f"{name}_unequal_s")
+    return [min(factor * (now + growth * max(side * unequal, 0.0)), most) for side in (1.0, -1.0)]
 
 
 def battery_factor(torques, speeds, discharge, charge, motors):
@@ -90,6 +104,7 @@ class Wheel:
     speed: float
     axle: object
     before: t.WheelState
+    target: float
     gated: bool = False
     doubtful: bool = False  # so near to its edge that rounding decides
     slip: float = 0.0
@@ -114,7 +129,7 @@ class Pair:
 
     wheels: list
     unequal_s: float
-    budget: float
+    budget: list
     unequal: bool = False
     short: bool = False
     asked: float = 0.0
@@ -139,23 +154,17 @@ def step(m, state, settings, vehicle, decide):
     first = state.steps == 0
     braking = m.power_demand_w < 0.0
     bits = set()
-    settings = settings._replace(slip_target=slip_target(state, settings, braking))
+    targets = slip_targets(state, settings, braking)
     standing = braking and m.speed_mps < settings.slip_speed_floor_mps
     wheels = [
-        Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i])
+        Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i], targets[i])
         for i, speed in enumerate(m.wheel_speed_radps)
     ]
     front, rear = axles = [
         Pair(
             wheels[k : k + 2],
             getattr(state, f"{name}_unequal_s"),
-            min(
-                getattr(settings, f"{name}_yaw_nm")
-                + getattr(settings, f"{name}_yaw_growth_nmps") * getattr(state, f"{name}_unequal_s"),
-                getattr(settings, f"{name}_yaw_most_nm"),
-            )
-            if braking
-            else getattr(settings, f"{name}_yaw_most_nm"),
+            yaw_budget(name, state, settings, m.speed_mps, braking),
         )
         for k, name in ((0, "front"), (2, "rear"))
     ]
@@ -203,13 +212,12 @@ def step(m, state, settings, vehicle, decide):
             brake = wheel.axle.friction_brake.max_torque_nm or weakest
             wheel.room = brake if braking else torque_limit(wheel.fast, wheel.before.heat, wheel.axle.motor)
             if settings.gate_mode == GATE_MODE_LIMITER:
-                wheel.grip = grip(braking, wheel.road, wheel.speed, m.speed_mps, settings, wheel.axle)
+                wheel.grip = grip(braking, wheel.road, wheel.speed, m.speed_mps, wheel.target, settings, wheel.axle)
             wheel.own = wheel.most = 0.0 if wheel.gated else min(wheel.room, wheel.grip)
-        weaker = min(wheel.most for wheel in axle.wheels)
         geometry = axle.wheels[0].axle
-        most = weaker + 2.0 * axle.budget * geometry.wheel.radius_m / geometry.track_width_m
-        for wheel in axle.wheels:
-            wheel.most = min(wheel.most, most)
+        mosts = [wheel.most for wheel in axle.wheels]
+        for wheel, other, moment in zip(axle.wheels, mosts[::-1], axle.budget, strict=True):
+            wheel.most = min(wheel.most, other + 2.0 * moment * geometry.wheel.radius_m / geometry.track_width_m)
 
     parts = {(False, False): (share, 1.0 - share), (True, False): (0.0, 1.0), (False, True): (1.0, 0.0)}
     parts = parts.get((front.gated, rear.gated), (0.0, 0.0))
