@@ -52,46 +52,55 @@ def nearest(axis, x):
 
 
 @kernel
-def _blend(low, high, fraction):
-    # At a grid point the other end must not count at all: 0 * inf would be NaN.
-    if fraction == 0.0:
-        return low
-    if fraction == 1.0:
-        return high
-    return low + fraction * (high - low)
+def _at_end(fraction):
+    """Whether a place is a grid point: there the other end must not count at all, 0 * inf would be NaN."""
+    return fraction == 0.0 or fraction == 1.0
+
+
+@kernel
+def _point(table, a, fa):
+    """Index of the point that a place is at, or that it lies beyond."""
+    return min(a + 1, table.shape[0] - 1) if fa == 1.0 else a
 
 
 @kernel
 def interpolate1(table, a, fa):
     """Value of a table[A] at cell (a, fa) as `locate` gives it."""
-    return _blend(table[a], table[min(a + 1, table.shape[0] - 1)], fa)
+    low = table[_point(table, a, fa)]
+    return low if _at_end(fa) else low + fa * (table[min(a + 1, table.shape[0] - 1)] - low)
 
 
 @kernel
 def interpolate2(table, a, fa, b, fb):
     """Bilinear value of table[A, B] at the cells (a, fa), (b, fb)."""
-    a1 = min(a + 1, table.shape[0] - 1)
-    return _blend(interpolate1(table[a], b, fb), interpolate1(table[a1], b, fb), fa)
+    low = interpolate1(table[_point(table, a, fa)], b, fb)
+    if _at_end(fa):
+        return low
+    return low + fa * (interpolate1(table[min(a + 1, table.shape[0] - 1)], b, fb) - low)
 
 
 @kernel
 def interpolate3(table, a, fa, b, fb, c, fc):
-    """Trilinear value of table[A, B, C] at three cells."""
-    a1 = min(a + 1, table.shape[0] - 1)
-    return _blend(interpolate2(table[a], b, fb, c, fc), interpolate2(table[a1], b, fb, c, fc), fa)
+    """Trilinear value of table[A, B, C] at the cells (a, fa), (b, fb), (c, fc)."""
+    low = interpolate2(table[_point(table, a, fa)], b, fb, c, fc)
+    if _at_end(fa):
+        return low
+    return low + fa * (interpolate2(table[min(a + 1, table.shape[0] - 1)], b, fb, c, fc) - low)
 
 
 @kernel
 def interpolate4(table, a, fa, b, fb, c, fc, d, fd):
-    """Multilinear value of table[A, B, C, D] at four cells."""
-    a1 = min(a + 1, table.shape[0] - 1)
-    return _blend(interpolate3(table[a], b, fb, c, fc, d, fd), interpolate3(table[a1], b, fb, c, fc, d, fd), fa)
+    """Multilinear value of table[A, B, C, D] at the cells (a, fa), (b, fb), (c, fc), (d, fd)."""
+    low = interpolate3(table[_point(table, a, fa)], b, fb, c, fc, d, fd)
+    if _at_end(fa):
+        return low
+    return low + fa * (interpolate3(table[min(a + 1, table.shape[0] - 1)], b, fb, c, fc, d, fd) - low)
 
 
 @kernel
 def interpolate5(table, a, fa, b, fb, c, fc, d, fd, e, fe):
-    """Multilinear value of table[A, B, C, D, E] at five cells."""
-    a1 = min(a + 1, table.shape[0] - 1)
-    return _blend(
-        interpolate4(table[a], b, fb, c, fc, d, fd, e, fe), interpolate4(table[a1], b, fb, c, fc, d, fd, e, fe), fa
-    )
+    """Multilinear value of table[A, B, C, D, E] at the cells (a, fa), (b, fb), (c, fc), (d, fd), (e, fe)."""
+    low = interpolate4(table[_point(table, a, fa)], b, fb, c, fc, d, fd, e, fe)
+    if _at_end(fa):
+        return low
+    return low + fa * (interpolate4(table[min(a + 1, table.shape[0] - 1)], b, fb, c, fc, d, fd, e, fe) - low)

@@ -17,7 +17,7 @@ from iwm_power_manager.model.gate import axle_gated, gated_split
 from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
 from iwm_power_manager.model.motor import idle_drag_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
-from iwm_power_manager.model.quasi_steady import USABLE_FRICTION, demand_force_n, split_outcome_w
+from iwm_power_manager.model.quasi_steady import USABLE_FRICTION, Axles, axles_of, demand_force_n, split_outcome_w
 from iwm_power_manager.model.torque import blend, conversion_speed_radps
 from iwm_power_manager.model.two_axles import UNSURE, Curve, Moved, Speeds, Torques, step_from
 from iwm_power_manager.model.tyre import peak_ratio, slip_ratio
@@ -155,7 +155,8 @@ def step_cost_and_next(
     `shortfall_w`. Braking is never short: what regeneration cannot take, friction does.
     """
     if problem.slip_model == SLIP_QUASI_STEADY:
-        return _quasi_steady_step(power_demand_w, speed_mps, front_share, vehicle, problem)
+        before = settled(power_demand_w, speed_mps, vehicle, problem)
+        return settled_step(before, power_demand_w, speed_mps, front_share, vehicle, problem)
     start = given(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
     moved = step_from(start.before, start.torques, start.before, problem.friction, UNSURE, problem.dt_s, vehicle)
     return outcome_of(power_demand_w, start, moved, vehicle, problem)
@@ -178,7 +179,8 @@ def step_near(
     `guess` and `curves` : see `two_axles.step_from`; not used where slip is settled.
     """
     if problem.slip_model == SLIP_QUASI_STEADY:
-        return _quasi_steady_step(power_demand_w, speed_mps, front_share, vehicle, problem), guess
+        before = settled(power_demand_w, speed_mps, vehicle, problem)
+        return settled_step(before, power_demand_w, speed_mps, front_share, vehicle, problem), guess
     start = given(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
     moved = step_from(start.before, start.torques, guess, problem.friction, curves, problem.dt_s, vehicle)
     return outcome_of(power_demand_w, start, moved, vehicle, problem), moved.speeds
@@ -302,21 +304,25 @@ def outcome_of(
     )
 
 
+class Settled(NamedTuple):
+    """What a step with settled slip comes to, whatever the share.
+
+    Attributes
+    ----------
+    force_n : road force the demand stands for
+    axles : what the car has for it
+    speed_mps : at the end of the step
+    """
+
+    force_n: float
+    axles: Axles
+    speed_mps: float
+
+
 @kernel
-def _quasi_steady_step(
-    power_demand_w: float, speed_mps: float, front_share: float, vehicle: VehicleParams, problem: ProblemParams
-) -> Step:
-    battery = vehicle.battery
-    dt = problem.dt_s
+def settled(power_demand_w: float, speed_mps: float, vehicle: VehicleParams, problem: ProblemParams) -> Settled:
+    """A step of a demand at a speed, before it is split."""
     force = demand_force_n(power_demand_w, speed_mps, problem.friction, True, vehicle)
-    power, missing, over = split_outcome_w(force, speed_mps, front_share, problem.friction, True, vehicle)
-    shortfall = 0.0
-    if power_demand_w > 0.0:
-        shortfall = missing * speed_mps + max(power - chemical_power_w(battery.discharge_limit_w, battery), 0.0)
-        given = force - missing
-    else:
-        power = max(power, chemical_power_w(-battery.charge_limit_w, battery))
-        given = force + missing
     # A driver makes up for what a split did not deliver: the speed follows what was asked for, as far as the road can
     # carry it. Would it follow what was delivered, then braking less than was asked for would leave a higher speed, at
     # which the same power is less force, and less of it were missing: a policy would be rewarded for not braking.
@@ -326,8 +332,31 @@ def _quasi_steady_step(
     )
     resistance = road_load_n(speed_mps, 0.0, vehicle.chassis)
     acceleration = (min(max(force, -grip), grip) - resistance) / equivalent_mass_kg(vehicle)
-    after = max(speed_mps + dt * acceleration, 0.0)
+    after = max(speed_mps + problem.dt_s * acceleration, 0.0)
+    return Settled(force, axles_of(force, speed_mps, problem.friction, True, vehicle), after)
+
+
+@kernel
+def settled_step(
+    before: Settled,
+    power_demand_w: float,
+    speed_mps: float,
+    front_share: float,
+    vehicle: VehicleParams,
+    problem: ProblemParams,
+) -> Step:
+    """`step_cost_and_next` with settled slip, from what `settled` says of the same demand and speed."""
+    battery, force = vehicle.battery, before.force_n
+    power, missing, over = split_outcome_w(before.axles, force, speed_mps, front_share, problem.friction, True, vehicle)
+    shortfall = 0.0
+    if power_demand_w > 0.0:
+        shortfall = missing * speed_mps + max(power - chemical_power_w(battery.discharge_limit_w, battery), 0.0)
+        given = force - missing
+    else:
+        power = max(power, chemical_power_w(-battery.charge_limit_w, battery))
+        given = force + missing
     # What is missing at rest still counts: a car that cannot pull away has not delivered its demand.
     rolling = max(speed_mps, vehicle.driver.power_speed_floor_mps)
     error = error_cost_j(force * rolling, given * rolling, problem)
-    return Step(power * dt + error + over * rolling * HANDOVER_S, after, 0.0, 0.0, shortfall)
+    cost = power * problem.dt_s + error + over * rolling * HANDOVER_S
+    return Step(cost, before.speed_mps, 0.0, 0.0, shortfall)

@@ -9,6 +9,8 @@ law does it; what neither can give is returned, not hidden.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, normal_forces_n, road_load_n
@@ -40,23 +42,72 @@ def axle_power_w(
     return 2.0 * electrical_power_w(torque, wheel_speed, motor)
 
 
+class Axles(NamedTuple):
+    """What a car at a speed, asked for a road force, has for it, however it is split.
+
+    Attributes
+    ----------
+    front_radps, rear_radps : of a rolling wheel
+    front_load_n, rear_load_n : of a wheel
+    front_grip_n, rear_grip_n : largest force that the tyres of the axle carry
+    front_room_n, rear_room_n : and that its motors give with it
+    """
+
+    front_radps: float
+    rear_radps: float
+    front_load_n: float
+    rear_load_n: float
+    front_grip_n: float
+    rear_grip_n: float
+    front_room_n: float
+    rear_room_n: float
+
+
+@kernel
+def axles_of(force_n: float, speed_mps: float, friction: float, slip_aware: bool, vehicle: VehicleParams) -> Axles:
+    """`Axles` at a speed > 0, m/s, and a force, N; not `slip_aware`, tyres carry anything."""
+    front, rear = vehicle.front, vehicle.rear
+    front_rolling = speed_mps / front.wheel.radius_m
+    rear_rolling = speed_mps / rear.wheel.radius_m
+    acceleration = (force_n - road_load_n(speed_mps, 0.0, vehicle.chassis)) / equivalent_mass_kg(vehicle)
+    front_load, rear_load = normal_forces_n(acceleration, speed_mps, 0.0, vehicle.chassis)
+    front_grip = rear_grip = 1e12
+    if slip_aware:
+        grip = 2.0 * USABLE_FRICTION * friction
+        front_grip = grip * peak_ratio(front.tyre) * front_load
+        rear_grip = grip * peak_ratio(rear.tyre) * rear_load
+    front_room, rear_room = front_grip, rear_grip
+    if force_n > 0.0:
+        front_room = min(front_room, 2.0 * torque_limit_nm(front_rolling, 0.0, front.motor) / front.wheel.radius_m)
+        rear_room = min(rear_room, 2.0 * torque_limit_nm(rear_rolling, 0.0, rear.motor) / rear.wheel.radius_m)
+    return Axles(front_rolling, rear_rolling, front_load, rear_load, front_grip, rear_grip, front_room, rear_room)
+
+
 @kernel
 def split_power_w(
     force_n: float, speed_mps: float, front_share: float, friction: float, slip_aware: bool, vehicle: VehicleParams
 ) -> tuple[float, float]:
     """Chemical battery power for a road force at a front share, W, and the force that cannot be delivered, N."""
-    power, missing, _ = split_outcome_w(force_n, speed_mps, front_share, friction, slip_aware, vehicle)
+    axles = axles_of(force_n, speed_mps, friction, slip_aware, vehicle)
+    power, missing, _ = split_outcome_w(axles, force_n, speed_mps, front_share, friction, slip_aware, vehicle)
     return power, missing
 
 
 @kernel
 def split_outcome_w(
-    force_n: float, speed_mps: float, front_share: float, friction: float, slip_aware: bool, vehicle: VehicleParams
+    axles: Axles,
+    force_n: float,
+    speed_mps: float,
+    front_share: float,
+    friction: float,
+    slip_aware: bool,
+    vehicle: VehicleParams,
 ) -> tuple[float, float, float]:
     """Chemical battery power for a road force at a front share, and what the axles could not do of it.
 
     Parameters
     ----------
+    axles : `axles_of` this force and speed
     force_n : sum of the tyre forces asked for, N, braking negative
     speed_mps : vehicle speed, > 0
     front_share : front axle's part of the force, 0..1; at 0 and 1 the other axle is idle
@@ -68,48 +119,31 @@ def split_outcome_w(
     battery power (W, eq. 21), missing force (N, >= 0), force an axle was asked for beyond its grip (N, >= 0; what the
     other one could take over of it is not missing)
     """
-    chassis = vehicle.chassis
-    front_radius = vehicle.front.wheel.radius_m
-    rear_radius = vehicle.rear.wheel.radius_m
-    front_motor = vehicle.front.motor
-    rear_motor = vehicle.rear.motor
-    front_rolling = speed_mps / front_radius
-    rear_rolling = speed_mps / rear_radius
-    acceleration = (force_n - road_load_n(speed_mps, 0.0, chassis)) / equivalent_mass_kg(vehicle)
-    normal_front, normal_rear = normal_forces_n(acceleration, speed_mps, 0.0, chassis)
-
+    front_motor, rear_motor = vehicle.front.motor, vehicle.rear.motor
     front = front_share * force_n
     rear = force_n - front
     if front == 0.0 and rear == 0.0:
-        idle_w = electrical_power_w(0.0, front_rolling, front_motor) + electrical_power_w(0.0, rear_rolling, rear_motor)
+        front_w = electrical_power_w(0.0, axles.front_radps, front_motor)
+        idle_w = front_w + electrical_power_w(0.0, axles.rear_radps, rear_motor)
         return chemical_power_w(2.0 * idle_w, vehicle.battery), 0.0, 0.0
     # An idle axle's drag is a force too; the working axle has to overcome it.
     if front == 0.0:
-        rear += 2.0 * idle_drag_nm(0.0, front_rolling, front_motor) / front_radius
+        rear += 2.0 * idle_drag_nm(0.0, axles.front_radps, front_motor) / vehicle.front.wheel.radius_m
     elif rear == 0.0:
-        front += 2.0 * idle_drag_nm(0.0, rear_rolling, rear_motor) / rear_radius
+        front += 2.0 * idle_drag_nm(0.0, axles.rear_radps, rear_motor) / vehicle.rear.wheel.radius_m
     sign = 1.0 if force_n > 0.0 else -1.0
     need_front = max(sign * front, 0.0)
     need_rear = max(sign * rear, 0.0)
 
-    room_front = 1e12
-    room_rear = 1e12
-    if slip_aware:
-        grip = 2.0 * USABLE_FRICTION * friction
-        room_front = grip * peak_ratio(vehicle.front.tyre) * normal_front
-        room_rear = grip * peak_ratio(vehicle.rear.tyre) * normal_rear
-    over = max(need_front - room_front, 0.0) + max(need_rear - room_rear, 0.0)
-    if sign > 0.0:
-        room_front = min(room_front, 2.0 * torque_limit_nm(front_rolling, 0.0, front_motor) / front_radius)
-        room_rear = min(room_rear, 2.0 * torque_limit_nm(rear_rolling, 0.0, rear_motor) / rear_radius)
-    given_front = min(need_front, room_front)
-    given_rear = min(need_rear + need_front - given_front, room_rear)
-    given_front = min(need_front + need_rear - given_rear, room_front)
+    over = max(need_front - axles.front_grip_n, 0.0) + max(need_rear - axles.rear_grip_n, 0.0)
+    given_front = min(need_front, axles.front_room_n)
+    given_rear = min(need_rear + need_front - given_front, axles.rear_room_n)
+    given_front = min(need_front + need_rear - given_rear, axles.front_room_n)
     missing = need_front + need_rear - given_front - given_rear
 
     power = axle_power_w(
-        sign * given_front, speed_mps, normal_front, friction, slip_aware, vehicle.front
-    ) + axle_power_w(sign * given_rear, speed_mps, normal_rear, friction, slip_aware, vehicle.rear)
+        sign * given_front, speed_mps, axles.front_load_n, friction, slip_aware, vehicle.front
+    ) + axle_power_w(sign * given_rear, speed_mps, axles.rear_load_n, friction, slip_aware, vehicle.rear)
     return chemical_power_w(power, vehicle.battery), missing, over
 
 

@@ -9,7 +9,7 @@ from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.parameters import VehicleParams
-from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
+from iwm_power_manager.model.quasi_steady import axles_of, demand_force_n, split_outcome_w
 
 if TYPE_CHECKING:
     from iwm_power_manager.control.settings import Settings
@@ -35,11 +35,12 @@ def cheapest_share(
     friction = situation.friction
     force = demand_force_n(situation.power_demand_w, situation.speed_mps, friction, slip_aware, vehicle)
     speed = max(situation.speed_mps, vehicle.driver.power_speed_floor_mps)
-    power, missing = split_power_w(force, speed, previous, friction, slip_aware, vehicle)
+    axles = axles_of(force, speed, friction, slip_aware, vehicle)
+    power, missing, _ = split_outcome_w(axles, force, speed, previous, friction, slip_aware, vehicle)
     best = previous
     best_power = power + PRICE_OF_MISSING * missing * speed - LEAST_DIFFERENCE_W
     for k in range(policy.share.size):
-        power, missing = split_power_w(force, speed, policy.share[k], friction, slip_aware, vehicle)
+        power, missing, _ = split_outcome_w(axles, force, speed, policy.share[k], friction, slip_aware, vehicle)
         power += PRICE_OF_MISSING * missing * speed + switching_power_w
         if power < best_power:
             best_power = power

@@ -8,7 +8,7 @@ costs what the budget of changes makes it (`control.budget`), and what is noise 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from iwm_power_manager.control.budget import affordable, price_factor, price_level, price_units
 from iwm_power_manager.control.persistence import SAMPLES, held_s
@@ -17,15 +17,31 @@ from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.grid import interpolate5, locate
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.model.decision import step_cost_and_next
+from iwm_power_manager.model.decision import SLIP_QUASI_STEADY, Settled, settled, settled_step, step_cost_and_next
 from iwm_power_manager.model.parameters import VehicleParams
 
 if TYPE_CHECKING:
     from iwm_power_manager.control.settings import Settings
 
 
+Cell = tuple[int, float]  # as `locate` gives it
+
 #: From this gain on a demand counts as it is: averaging would change nothing that matters.
 _LASTING = 0.99
+
+
+class _Ahead(NamedTuple):
+    """What a demand leads to, whatever the share, where slip is settled; cells of the demand and of the speed after."""
+
+    settled: Settled
+    power: Cell
+    speed: Cell
+
+
+@kernel
+def _ahead(power_demand_w: float, situation: Situation, vehicle: VehicleParams, policy: PolicyTable) -> _Ahead:
+    before = settled(power_demand_w, situation.speed_mps, vehicle, policy.problem)
+    return _Ahead(before, locate(policy.power_w, power_demand_w), locate(policy.speed_mps, before.speed_mps))
 
 
 @kernel
@@ -37,15 +53,16 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
     level = price_level(factor) if policy.dearer_cost_j.shape[0] > 0 else 0.0
     price = factor * policy.switching_cost_j
     budgeted = policy.changes_per_min > 0.0
+    ahead = _ahead(situation.power_demand_w, situation, vehicle, policy)
     best = previous
-    best_cost = _cost_j(situation, previous, level, vehicle, policy) - LEAST_DIFFERENCE_W * policy.problem.dt_s
+    best_cost = _cost_j(ahead, situation, previous, level, vehicle, policy) - LEAST_DIFFERENCE_W * policy.problem.dt_s
     for k in range(policy.share.size):
         share = policy.share[k]
         move = share - previous
         if move == 0.0 or not affordable(share, previous, used, policy.changes_per_min):
             continue
         switching = price * (price_units(move) if budgeted else abs(move)) + policy.switching_fixed_cost_j
-        cost = _cost_j(situation, share, level, vehicle, policy) + switching
+        cost = _cost_j(ahead, situation, share, level, vehicle, policy) + switching
         if cost < best_cost:
             best_cost = cost
             best = share
@@ -53,25 +70,30 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
 
 
 @kernel
-def _cost_j(situation: Situation, share: float, level: float, vehicle: VehicleParams, policy: PolicyTable) -> float:
+def _cost_j(
+    ahead: _Ahead, situation: Situation, share: float, level: float, vehicle: VehicleParams, policy: PolicyTable
+) -> float:
     """Cost of a step with this share and of all that follows, J, in the mean over what the demand jitters between."""
     gain = situation.jitter.gain
+    demand_w = situation.power_demand_w
     if gain > _LASTING:
-        return _demand_cost_j(situation.power_demand_w, situation, share, level, 1.0, vehicle, policy)
+        return _demand_cost_j(ahead, demand_w, situation, share, level, 1.0, vehicle, policy)
     steps = 1.0 + held_s(gain) / policy.problem.dt_s
-    total = gain * _demand_cost_j(situation.power_demand_w, situation, share, level, steps, vehicle, policy)
+    total = gain * _demand_cost_j(ahead, demand_w, situation, share, level, steps, vehicle, policy)
     weights = gain
     weight = gain
     for i in range(min(SAMPLES, situation.jitter.taken)):
         weight *= 1.0 - gain
         sample_w = situation.jitter.samples_w[i]
-        total += weight * _demand_cost_j(sample_w, situation, share, level, steps, vehicle, policy)
+        sampled = _ahead(sample_w, situation, vehicle, policy)
+        total += weight * _demand_cost_j(sampled, sample_w, situation, share, level, steps, vehicle, policy)
         weights += weight
     return total / weights
 
 
 @kernel
 def _demand_cost_j(
+    ahead: _Ahead,
     power_demand_w: float,
     situation: Situation,
     share: float,
@@ -84,17 +106,16 @@ def _demand_cost_j(
 
     `steps` is how many times the step's cost counts.
     """
-    outcome = step_cost_and_next(
-        power_demand_w,
-        situation.speed_mps,
-        situation.front_slip,
-        situation.rear_slip,
-        share,
-        vehicle,
-        policy.problem,
-    )
-    a, fa = locate(policy.power_w, power_demand_w)
-    b, fb = locate(policy.speed_mps, outcome.speed_mps)
+    speed, problem = situation.speed_mps, policy.problem
+    a, fa = ahead.power
+    b, fb = ahead.speed
+    if problem.slip_model == SLIP_QUASI_STEADY:
+        outcome = settled_step(ahead.settled, power_demand_w, speed, share, vehicle, problem)
+    else:
+        outcome = step_cost_and_next(
+            power_demand_w, speed, situation.front_slip, situation.rear_slip, share, vehicle, problem
+        )
+        b, fb = locate(policy.speed_mps, outcome.speed_mps)
     c, fc = locate(policy.slip_front, outcome.slip_front)
     d, fd = locate(policy.slip_rear, outcome.slip_rear)
     e, fe = locate(policy.previous_share, share)
