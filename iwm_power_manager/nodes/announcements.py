@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -114,6 +115,7 @@ class Announcements:
         topics: Mapping[str, tuple[str, ...]],
         trouble: Mapping[str, str],
         wheel_names: Sequence[str],
+        now_ns: int,
     ) -> None:
         """Tell what has changed since the last call, while active.
 
@@ -123,17 +125,18 @@ class Announcements:
         topics : of each input
         trouble : why a topic is not heard, by topic
         wheel_names : the wheels in their order
+        now_ns : the node's clock
         """
         mode, stale = controller.supervision.mode, controller.supervision.stale
         if not self._torque_seen and controller.command and any(controller.command.motor_torque_nm):
             self._torque_seen = True
             self._logger.info(f"first torque: {sum(controller.command.motor_torque_nm):.1f} N m over all wheels")
         if mode == MODE_WAITING and self._due("waiting"):
-            waits = self._missing(controller, topics, trouble, ~0)
+            waits = self._missing(controller, topics, trouble, ~0, now_ns)
             if waits:
                 self._logger.info(f"waits for {waits}")
         if (mode == MODE_DEGRADED and mode != self._mode) or (stale & ~self._stale and mode == MODE_DEGRADED):
-            missing = self._missing(controller, topics, trouble, stale) or _FOR_A_MOMENT
+            missing = self._missing(controller, topics, trouble, stale, now_ns) or _FOR_A_MOMENT
             self._logger.warning(f"degraded, motor torque fades: {missing}")
         elif mode == MODE_NORMAL and mode != self._mode:
             self._logger.info(f"{'recovered' if self._was_degraded else 'all inputs are there'}: normal operation")
@@ -154,6 +157,7 @@ class Announcements:
         topics: Mapping[str, tuple[str, ...]],
         trouble: Mapping[str, str],
         stale: int,
+        now_ns: int,
     ) -> str:
         parts = []
         for bit, name in STALE_NAMES.items():
@@ -165,8 +169,9 @@ class Announcements:
             reason = "; ".join(dict.fromkeys(trouble[topic] for topic in silent))
             if not reason and tally.why():
                 reason = f"{sum(tally.dropped.values())} messages refused, {tally.why()}"
-            elif not reason and tally.received and tally.accepted_ns is None:
-                reason = "none since it started over"
+            elif not reason and tally.received:
+                age_s = tally.age_s(now_ns)
+                reason = "none since it started over" if math.isinf(age_s) else f"none for {age_s:.2f} s"
             where = ", ".join(topic for topic in silent or found if topic != name)
             parts.append(f"{name}" + (f" on {where}" if where else "") + (f" ({reason})" if reason else ""))
         return ", ".join(parts)
