@@ -332,20 +332,10 @@ def _pattern(text: str) -> re.Pattern[str] | None:
 
 
 def _options(values: Mapping[str, Any]) -> RecordingOptions:
-    return RecordingOptions(
-        writer=WriterOptions(
-            compression=values["compression"],
-            chunk_bytes=values["chunk_bytes"],
-            max_bytes=values["max_bytes"],
-            max_duration_ns=int(values["max_duration_s"] * 1e9),
-            max_message_bytes=values["max_message_bytes"],
-        ),
-        flush_period_s=values["flush_period_s"],
-        sync=values["sync"],
-        queue_bytes=values["queue_bytes"],
-        snapshot_s=values["snapshot_s"],
-        snapshot_bytes=values["snapshot_bytes"],
-    )
+    of_writer = {name: values[name] for name in ("compression", "chunk_bytes", "max_bytes", "max_message_bytes")}
+    writer = WriterOptions(max_duration_ns=int(values["max_duration_s"] * 1e9), **of_writer)
+    names = ("flush_period_s", "sync", "queue_bytes", "snapshot_s", "snapshot_bytes")
+    return RecordingOptions(writer=writer, **{name: values[name] for name in names})
 
 
 def _custom_data(values: Mapping[str, Any]) -> dict[str, str]:

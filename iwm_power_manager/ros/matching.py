@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, qos_check_compatible
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 
 
 def mismatched_publishers(
@@ -25,20 +25,16 @@ def mismatched_publishers(
     found = {}
     for subscription in subscriptions:
         topic = subscription.topic_name
-        if subscription.get_publisher_count() >= node.count_publishers(topic):
-            continue
-        lines = []
-        for info in node.get_publishers_info_by_topic(topic):
-            if info.topic_type != msgtypes[topic]:
+        if subscription.get_publisher_count() < node.count_publishers(topic):
+            lines = []
+            for info in node.get_publishers_info_by_topic(topic):
                 sent = info.topic_type
-                lines.append(f"{_name(info)} sends {sent}, not {msgtypes[topic]}{remedy(topic, sent)}")
-                continue
-            fits, reason = qos_check_compatible(info.qos_profile, subscription.qos_profile)
-            if fits == QoSCompatibility.ERROR:
-                lines.append(f"{_name(info)} offers another quality of service: {_short(reason)}")
-        if lines:
+                if sent != msgtypes[topic]:
+                    lines.append(f"{_name(info)} sends {sent}, not {msgtypes[topic]}{remedy(topic, sent)}")
+                elif reason := _misfit(info.qos_profile, subscription.qos_profile):
+                    lines.append(f"{_name(info)} offers another quality of service: {reason}")
             found[topic] = "; ".join(lines)
-    return found
+    return {topic: text for topic, text in found.items() if text}
 
 
 def mismatched_subscribers(node: Node, publishers: Iterable[Any], msgtypes: dict[str, str]) -> dict[str, str]:
@@ -46,26 +42,25 @@ def mismatched_subscribers(node: Node, publishers: Iterable[Any], msgtypes: dict
     found = {}
     for publisher in publishers:
         topic = publisher.topic_name
-        if publisher.get_subscription_count() >= node.count_subscribers(topic):
-            continue
-        lines = []
-        for info in node.get_subscriptions_info_by_topic(topic):
-            if info.topic_type != msgtypes[topic]:
-                lines.append(f"{_name(info)} wants {info.topic_type}, not {msgtypes[topic]}")
-                continue
-            fits, reason = qos_check_compatible(publisher.qos_profile, info.qos_profile)
-            if fits == QoSCompatibility.ERROR:
-                lines.append(f"{_name(info)} asks for another quality of service: {_short(reason)}")
-        if lines:
+        if publisher.get_subscription_count() < node.count_subscribers(topic):
+            lines = []
+            for info in node.get_subscriptions_info_by_topic(topic):
+                if info.topic_type != msgtypes[topic]:
+                    lines.append(f"{_name(info)} wants {info.topic_type}, not {msgtypes[topic]}")
+                elif reason := _misfit(publisher.qos_profile, info.qos_profile):
+                    lines.append(f"{_name(info)} asks for another quality of service: {reason}")
             found[topic] = "; ".join(lines)
-    return found
+    return {topic: text for topic, text in found.items() if text}
 
 
 def _name(info: Any) -> str:
     return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 
-def _short(reason: str) -> str:
+def _misfit(offered: QoSProfile, wanted: QoSProfile) -> str:
     """The policies that do not fit, of a text such as "ERROR: Best effort publisher and reliable subscription;"."""
+    fits, reason = qos_check_compatible(offered, wanted)
+    if fits != QoSCompatibility.ERROR:
+        return ""
     parts = [part.removeprefix("ERROR:").strip() for part in reason.split(";")]
     return ", ".join(part.lower() for part in parts if part and not part.startswith("WARNING"))

@@ -29,9 +29,10 @@ from iwm_power_manager.replay.commands import command_topics
 from iwm_power_manager.replay.plan import Choice, Plan, make_plan, recorded_mapping
 from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds, state_topic
 from iwm_power_manager.replay.what_if import Consumption, what_if
-from iwm_power_manager.tools.command import described
+from iwm_power_manager.tools.command import DONE, described, ended
+from iwm_power_manager.tools.options import number, whole
 
-DONE, DIFFERENT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DIFFERENT = 1
 
 _DESCRIPTION = """\
 Run the control law over a recorded drive, without DDS and without a clock: the same bag gives the same bytes every
@@ -56,20 +57,15 @@ exit codes: 0 done, 1 recomputed and recorded differ (--compare), 2 bad argument
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     options = _parser().parse_args(args)
-    try:
+
+    def work() -> int:
         _check(options)
         if options.publish:
             return _publish(options)
         with BagReader(options.bag) as bag:
             return _replay(bag, options) if options.what_if is None else _what_if(bag, options)
-    except IwmError as error:
-        print(f"replay: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()  # whoever read our output has had enough
-        return DONE
+
+    return ended("replay", work)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -80,13 +76,13 @@ def _parser() -> argparse.ArgumentParser:
     law.add_argument("--vehicle", metavar="YAML", help="the car")
     law.add_argument("--policy", metavar="FILE", help="policy file, or folder of policies over friction")
     law.add_argument("--strategy", metavar="NAME", nargs="+", help=strategies)
-    law.add_argument("--friction", type=float, metavar="MU", help="peak friction the strategy assumes")
+    law.add_argument("--friction", type=number(0.05, 1.5), metavar="MU", help="peak friction the strategy assumes")
     law.add_argument("--set", dest="settings", metavar="NAME=VALUE", action="append", default=[], help="a setting")
     law.add_argument("--mapping", metavar="YAML", help="fields and units of another car's bag (config/signals/)")
     out = parser.add_argument_group("results")
     out.add_argument("--output", metavar="DIR", help="write a bag: inputs as recorded, commands recomputed")
     out.add_argument("--compare", action="store_true", help="recomputed against recorded; exit code 1 if they differ")
-    out.add_argument("--tolerance", type=float, default=0.0, metavar="X", help="difference that is none (default 0)")
+    out.add_argument("--tolerance", type=number(0.0, 1e9), default=0.0, metavar="X", help="difference that is none")
     out.add_argument(
         "--what-if",
         metavar="YAML",
@@ -97,13 +93,14 @@ def _parser() -> argparse.ArgumentParser:
     out.add_argument("--json", metavar="FILE", help="write the result as JSON; - for standard output")
     out.add_argument("--quiet", action="store_true", help="no progress bar")
     play = parser.add_argument_group("publishing")
+    seconds = number(0.0, 1e9)
     play.add_argument("--publish", action="store_true", help="publish the inputs and /clock instead of computing")
-    play.add_argument("--rate", type=float, default=1.0, metavar="X", help="times real time (default 1)")
+    play.add_argument("--rate", type=number(0.001, 1000.0), default=1.0, metavar="X", help="times real time")
     play.add_argument("--step", action="store_true", help="go on by 10 ms at each Enter")
-    play.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds into the bag to begin at")
-    play.add_argument("--end", type=float, metavar="S", help="seconds into the bag to end at")
+    play.add_argument("--start", type=seconds, default=0.0, metavar="S", help="seconds into the bag to begin at")
+    play.add_argument("--end", type=seconds, metavar="S", help="seconds into the bag to end at")
     play.add_argument("--loop", action="store_true", help="begin again at the end")
-    play.add_argument("--listeners", type=int, default=0, metavar="N", help="begin when each topic has so many")
+    play.add_argument("--listeners", type=whole(0, 1000), default=0, metavar="N", help="wait for so many of each topic")
     play.add_argument("--topics", nargs="+", metavar="TOPIC", help="publish these only; default: all but the commands")
     return parser
 
@@ -119,14 +116,8 @@ def _check(options: argparse.Namespace) -> None:
         )
     if options.what_if is None and len(options.strategy or []) > 1:
         raise ConfigError("arguments", "--strategy", "several make sense with --what-if only")
-    check_number("arguments", "--tolerance", options.tolerance, 0.0)
-    check_number("arguments", "--rate", options.rate, 0.001, 1000.0)
-    check_number("arguments", "--start", options.start, 0.0)
-    check_number("arguments", "--listeners", options.listeners, 0, 1000)
     if options.end is not None:
         check_number("arguments", "--end", options.end, options.start, above=True)
-    if options.friction is not None:
-        check_number("arguments", "--friction", options.friction, 0.05, 1.5)
 
 
 def _plan(bag: BagReader, options: argparse.Namespace, vehicle: str | None, strategy: str | None) -> Plan:
@@ -149,7 +140,7 @@ def _replay(bag: BagReader, options: argparse.Namespace) -> int:
                     output.write(message, steps)
         if not replay.report().steps:
             raise BagError(f"{bag.path}: gave no control step: {replay.why_no_step()}")
-    except IwmError:
+    except (IwmError, KeyboardInterrupt):
         if writer is not None:  # what there is of it is of no use, and would be in the way of the next attempt
             writer.abandon()
             shutil.rmtree(writer.path, ignore_errors=True)

@@ -17,7 +17,8 @@ from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.recorded import read_signal
 from iwm_power_manager.replay.run import Replay
 from iwm_power_manager.signals.mapping import load_mapping
-from iwm_power_manager.tools.replay import BAD_INPUT, DONE, main
+from iwm_power_manager.tools.command import BAD_INPUT, DONE
+from iwm_power_manager.tools.replay import main
 
 FORKED = f"geometry_msgs/Twist twist\n{LINE}\nMSG: geometry_msgs/Twist\nfloat64 x\n"
 
@@ -206,7 +207,7 @@ def test_parameters_in_a_bag_name_no_file_and_bring_nothing_down(
     foreign.write_metadata(tmp_path / "bag", CHANNELS, custom_data={"parameters /power_manager": parameters})
     assert main([str(tmp_path / "bag"), "--mapping", str(mapping)]) == BAD_INPUT
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("replay: ")
+    assert line.startswith("replay: error: ")
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,8 @@ from iwm_power_manager.replay.run import STATE, Replay
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import standard_types
-from iwm_power_manager.tools.replay import BAD_INPUT, DIFFERENT, DONE, main
+from iwm_power_manager.tools.command import BAD_INPUT, DONE
+from iwm_power_manager.tools.replay import DIFFERENT, main
 
 COUNT = 150
 STRATEGY = "instantaneous_slip"
@@ -452,10 +453,14 @@ def test_energy_of_a_constant_step_is_power_times_time(drive: Path) -> None:
 def test_a_mistake_gets_one_line_and_exit_code_2(
     arguments: list[str], line: str, drive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([argument.replace("{drive}", str(drive)) for argument in arguments]) == BAD_INPUT
+    try:
+        code = main([argument.replace("{drive}", str(drive)) for argument in arguments])
+    except SystemExit as ended:  # a value that the parser refuses
+        code = ended.code
+    assert code == BAD_INPUT
     error = capsys.readouterr().err
     assert line in error
-    assert error.startswith("replay: ")
+    assert error.startswith("replay: error: ")
     assert len(error.strip().splitlines()) == 1
 
 

@@ -22,7 +22,8 @@ from iwm_power_manager.ros.player import paced
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.contract import FRICTION_BRAKE_COMMAND as FRICTION_COMMAND
 from iwm_power_manager.signals.contract import WHEEL_TORQUE_COMMAND as MOTOR_COMMAND
-from iwm_power_manager.tools.replay import DIFFERENT, DONE, main
+from iwm_power_manager.tools.command import DONE
+from iwm_power_manager.tools.replay import DIFFERENT, main
 
 PATIENCE_S = 90.0
 COUNT = 120
@@ -190,7 +191,7 @@ def test_an_unknown_topic_is_named(tmp_path: Path, start: Callable[..., subproce
     player = start("tools.replay", str(inputs), "--publish", "--topics", "/nope")
     _, error = player.communicate(timeout=PATIENCE_S)
     assert player.returncode == 2
-    assert error.startswith(f"replay: {inputs}: holds no topic /nope; it holds /battery_state, ")
+    assert error.startswith(f"replay: error: {inputs}: holds no topic /nope; it holds /battery_state, ")
 
 
 def clocked(path: Path, clock_ns: Callable[[int], int], *more: foreign.Channel) -> Path:
