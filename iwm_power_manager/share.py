@@ -53,9 +53,10 @@ def share_path(relative: Path | str) -> Path:
 def resolve(path: Path | str) -> Path:
     """Give the file a user means by `path`.
 
-    An absolute path, or one that exists seen from the current folder, is taken as it is. Otherwise it is looked for
-    among the files of the package, so that `config/vehicles/jalalmaab_2015.yaml`, and `jalalmaab_2015` alone, work from
-    anywhere. A path that is nowhere comes back unchanged: whoever opens it reports it under the name the user gave.
+    An absolute path, or one that exists seen from the current folder, is taken as it is; but a folder there hides no
+    file of the package with its name, such as `nycc` the cycle. Otherwise it is looked for among the files of the
+    package, so that `config/vehicles/jalalmaab_2015.yaml`, and `jalalmaab_2015` alone, work from anywhere. A path that
+    is nowhere comes back unchanged: whoever opens it reports it under the name the user gave.
 
     Raises
     ------
@@ -63,17 +64,19 @@ def resolve(path: Path | str) -> Path:
         If a name alone fits several files of the package, or none but is much like some.
     """
     given = Path(path).expanduser()
-    if given.is_absolute() or given.exists():
+    if given.is_absolute() or (given.exists() and not given.is_dir()):
         return given
     for root in roots():
-        if (root / given).exists():
+        if (root / given).exists() and not given.exists():
             return root / given
         matches = _files_named(root, str(given)) if len(given.parts) == 1 else []
-        if len(matches) > 1:
+        if len(matches) > 1 and not given.exists():
             names = ", ".join(str(match.relative_to(root)) for match in matches)
             raise ConfigError(given, "", "fits several files of the package", names)
-        if matches:
+        if len(matches) == 1:
             return matches[0]
+    if given.exists():
+        return given
     known = {path.name for root in roots() for path in _files(root)} if len(given.parts) == 1 else set()
     near = did_you_mean(given, known)
     if near:

@@ -24,6 +24,14 @@ def test_the_users_own_file_goes_before_that_of_the_package(tmp_path: Path, monk
     assert share.resolve("config/cycles/nycc.csv").samefile(own)
 
 
+def test_a_folder_hides_no_file_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "nycc").mkdir()
+    (tmp_path / "mine").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert share.resolve("nycc").name == "nycc.csv"
+    assert share.resolve("mine") == Path("mine")
+
+
 def test_a_file_below_an_ament_prefix_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     installed = tmp_path / "share" / "iwm_power_manager" / "config" / "only_here.yaml"
     installed.parent.mkdir(parents=True)
