@@ -126,12 +126,12 @@ def split_outcome_w(
         front_w = electrical_power_w(0.0, axles.front_radps, front_motor)
         idle_w = front_w + electrical_power_w(0.0, axles.rear_radps, rear_motor)
         return chemical_power_w(2.0 * idle_w, vehicle.battery), 0.0, 0.0
-    # An idle axle's drag is a force too; the working axle has to overcome it.
-    if front == 0.0:
-        rear += 2.0 * idle_drag_nm(0.0, axles.front_radps, front_motor) / vehicle.front.wheel.radius_m
-    elif rear == 0.0:
-        front += 2.0 * idle_drag_nm(0.0, axles.rear_radps, rear_motor) / vehicle.rear.wheel.radius_m
     sign = 1.0 if force_n > 0.0 else -1.0
+    # An idle axle's drag is a force too; the working axle has to overcome it. One that has to help is not idle.
+    if front == 0.0 and sign * rear <= axles.rear_room_n:
+        rear += 2.0 * idle_drag_nm(0.0, axles.front_radps, front_motor) / vehicle.front.wheel.radius_m
+    elif rear == 0.0 and sign * front <= axles.front_room_n:
+        front += 2.0 * idle_drag_nm(0.0, axles.rear_radps, rear_motor) / vehicle.rear.wheel.radius_m
     need_front = max(sign * front, 0.0)
     need_rear = max(sign * rear, 0.0)
 

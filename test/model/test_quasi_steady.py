@@ -76,9 +76,15 @@ def test_slip_costs_power():
 def test_what_one_axle_cannot_give_goes_to_the_other():
     # One axle's motors give 2 * 200 N m / 0.33 m = 1212 N.
     assert split_power_w(2000.0, 5.0, 1.0, 0.9, False, CAR)[1] == 0.0
-    assert split_power_w(3000.0, 5.0, 1.0, 0.9, False, CAR)[1] == pytest.approx(
-        3000.0 + 2.0 * (0.69 + 0.0151 * 5.0 / 0.33) / 0.33 - 2424.24, abs=0.01
-    )
+    assert split_power_w(3000.0, 5.0, 1.0, 0.9, False, CAR)[1] == pytest.approx(3000.0 - 2424.24, abs=0.01)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_an_axle_that_has_to_help_is_not_idle_and_its_drag_brakes_nothing(share):
+    """On ice, 2000 N of braking are beyond both axles: no share may seem to deliver more of it than another."""
+    alone = split_power_w(-2000.0, 15.0, share, 0.2, True, CAR)[1]
+    assert alone == pytest.approx(split_power_w(-2000.0, 15.0, 0.5, 0.2, True, CAR)[1], abs=1e-6)
+    assert alone > 300.0
 
 
 def test_a_demand_stands_for_a_force_at_no_less_than_the_floor_speed():

@@ -26,19 +26,19 @@ def split_w(force, speed, share, friction, slip_aware, vehicle):
     normal = normal_forces((force - road_load(speed, 0.0, car)) / mass, speed, 0.0, car)
     direction = 1.0 if force > 0.0 else -1.0
     asked = [share * force, force - share * force]
-    if 0.0 in asked:
-        idle = asked.index(0.0)
-        motor = axles[idle].motor
-        if motor.idle_drive == 1:
-            drag = motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * rolling[idle]
-            asked[1 - idle] += 2.0 * drag / axles[idle].wheel.radius_m
-    asked = [max(direction * x, 0.0) for x in asked]
     room = [1e12, 1e12]
     for i, axle in enumerate(axles):
         if slip_aware:
             room[i] = 0.99 * 2.0 * friction * axle.tyre.coefficients[2] * normal[i]
         if direction > 0.0:
             room[i] = min(room[i], 2.0 * torque_limit(rolling[i], 0.0, axle.motor) / axle.wheel.radius_m)
+    if 0.0 in asked:
+        idle = asked.index(0.0)
+        motor = axles[idle].motor
+        if motor.idle_drive == 1 and direction * asked[1 - idle] <= room[1 - idle]:
+            drag = motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * rolling[idle]
+            asked[1 - idle] += 2.0 * drag / axles[idle].wheel.radius_m
+    asked = [max(direction * x, 0.0) for x in asked]
     given = [min(a, r) for a, r in zip(asked, room, strict=True)]
     for axle in (1, 0):
         short = sum(asked) - sum(given)
