@@ -294,10 +294,6 @@ def ablation_table(study: Study) -> TableOf:
     )
 
 
-#: Who know the whole cycle, and what their changes cost.
-_BOUNDS = {BOUND: "in our budget", FREE_BOUND: "changes free"}
-
-
 def _percent(part: float | None) -> float | None:
     return None if part is None else 100.0 * part
 
@@ -314,10 +310,11 @@ def rivals(study: Study) -> Iterator[TableOf]:
         *(
             Column(label, _saving(label), "%", 2, group="saving")
             for label in labels
-            if label not in (*prices, *_BOUNDS)
+            if label not in (*prices, BOUND, FREE_BOUND)
         ),
         *(Column(price, _saving(label), "%", 2, group=INSTANTANEOUS_SLIP) for label, price in prices.items()),
-        *(Column(text, _saving(label), "%", 2, group="preview") for label, text in _BOUNDS.items() if label in labels),
+        Column("in our budget", _saving(BOUND), "%", 2, group="preview"),
+        Column("changes free", most_saved, "%", 2, group="preview"),
         Column("ours of possible", lambda by: _percent(by[OURS].share_of_possible), "%", 0),
         Column("ours", _changes(OURS), "1/min", 1, group="changes"),
         *(Column(price, _changes(label), "1/min", 1, group="changes") for label, price in prices.items()),
@@ -334,9 +331,9 @@ def rivals(study: Study) -> Iterator[TableOf]:
             "Saving of battery energy against equal split on the same road; no number where one of them lost the "
             "trace or the distances differ by more than 0.1 %. instantaneous_slip changes the share only to save the "
             "power shown. Preview knows the whole cycle; it has our budget of changes (called possible elsewhere), or "
-            "changes that cost it nothing. The latter plans on a demand in which changes take no time; driven, each "
-            "takes 0.05 s and moves the driver's demand, so that many small ones can save less than few. Ours of "
-            "possible: our saving as a part of the most that preview or another strategy saves within our budget. "
+            "makes as many as it likes: the best of a plan with free changes and of all other strategies, since a "
+            "change takes 0.05 s and moves the driver's demand, so that many small ones can save less than few. Ours "
+            "of possible: our saving as a part of the most that preview or another strategy saves within our budget. "
             "Changes: those by more than 0.25; moved is the sum of all, 1 being all the power; blind is instantaneous.",
         )
 
