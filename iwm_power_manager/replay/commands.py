@@ -11,8 +11,8 @@ from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
 from iwm_power_manager.replay.steps import ReplayedStep
 from iwm_power_manager.signals.cdr import MessageReader, names_path
-from iwm_power_manager.signals.commands import MOTOR, CommandWriter, Sink
-from iwm_power_manager.signals.contract import WHEEL_NAMES
+from iwm_power_manager.signals.commands import MOTOR, CommandWriter, Sink, parts_of
+from iwm_power_manager.signals.contract import JOINT_STATE, WHEEL_NAMES
 from iwm_power_manager.signals.mapping import SignalMapping, topic_named
 from iwm_power_manager.signals.readings import NamedValues
 from iwm_power_manager.signals.types import types_of
@@ -51,6 +51,8 @@ class RecordedCommand:
         self.kind, self.name = kind, name
         self._names = tuple(sink.names[wheel] if sink.names else WHEEL_NAMES[wheel] for wheel in sink.wheels)
         self._write = CommandWriter(mapping.path, [sink])
+        # What a message of less than double precision would hold, only its bytes tell.
+        self._parts = parts_of(sink) if topic.type == JOINT_STATE else ()
         self._read = MessageReader(
             types_of(topic.type, topic.encoding, topic.definition),
             [sink.field],
@@ -92,9 +94,13 @@ class RecordedCommand:
                 self._comparer.recorded(-self._alone, log_time_ns, found.names, found.values)
             for _, log_time_ns, found in due[-1:]:
                 self._comparer.recorded(step.stamp_ns, log_time_ns, found.names, found.values)
-        ((_, data),) = self._write(step.stamp_ns, torques_nm(step, self.kind))
-        sent = self._read(data)
-        self._comparer.recomputed(step.stamp_ns, step.log_time_ns, sent.names, sent.values)
+        torques = torques_nm(step, self.kind)
+        if self._parts:
+            values = tuple([factor * torques[wheel] for wheel, factor in self._parts])
+        else:
+            ((_, data),) = self._write(step.stamp_ns, torques)
+            values = self._read(data).values
+        self._comparer.recomputed(step.stamp_ns, step.log_time_ns, self._names, values)
 
     def result(self) -> TopicComparison:
         """What has been found so far."""

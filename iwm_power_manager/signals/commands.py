@@ -144,7 +144,7 @@ class CommandWriter:
     """
 
     def __init__(self, file: Path, sinks: Sequence[Sink]) -> None:
-        self._writers = [(sink.topic, _parts(sink), _writer(file, sink)) for sink in sinks]
+        self._writers = [(sink.topic, parts_of(sink), _writer(file, sink)) for sink in sinks]
 
     def __call__(self, stamp_ns: int, torque_nm: Sequence[float]) -> list[tuple[str, bytes]]:
         """Topic and bytes of each message."""
@@ -154,7 +154,7 @@ class CommandWriter:
         ]
 
 
-def _parts(sink: Sink) -> list[tuple[int, float]]:
+def parts_of(sink: Sink) -> list[tuple[int, float]]:
     """Wheel and factor of each number of the message."""
     return [(wheel, sink.factors[wheel if len(sink.factors) > 1 else 0]) for wheel in sink.wheels]
 
