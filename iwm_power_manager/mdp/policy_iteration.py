@@ -426,13 +426,18 @@ class _Operator:
         plane = self.model.cell_shape[1] * self.model.cell_shape[2]
         over_ranges(
             flat.shape[1],
+            cost.size,
             lambda first, last: expect_over_demand(self.model.demand, flat, cells, plane, first, last, ahead),
         )
         self.sweeps += 1
 
     def improve(self, cost: NDArray[np.float64], out: NDArray[np.float64], policy: NDArray[np.int16]) -> None:
         self._expect(cost)
-        over_ranges(cost.shape[0], lambda first, last: improve(self.model, self.ahead, first, last, out, policy))
+        over_ranges(
+            cost.shape[0],
+            self.model.free_cost.size,
+            lambda first, last: improve(self.model, self.ahead, first, last, out, policy),
+        )
 
     def evaluate(
         self, cost: NDArray[np.float64], policy: NDArray[np.int16], cost_factor: float, out: NDArray[np.float64]
@@ -440,6 +445,7 @@ class _Operator:
         self._expect(cost)
         over_ranges(
             cost.shape[0],
+            cost.size,
             lambda first, last: apply_policy(self.model, self.ahead, policy, cost_factor, first, last, out),
         )
 

@@ -10,6 +10,8 @@ from itertools import pairwise
 
 #: More ranges than threads, so that one slow range does not leave the other cores idle.
 _RANGES_PER_THREAD = 6
+#: Numbers to compute that are worth a range of their own: handing one over takes as long as some thousand of them.
+_WORTH_A_RANGE = 16384
 
 
 @cache
@@ -17,21 +19,28 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="solver")
 
 
-def over_ranges(size: int, function: Callable[[int, int], None]) -> None:
+def over_ranges(size: int, numbers: int, function: Callable[[int, int], None]) -> None:
     """Call function(first, last) for consecutive ranges that cover 0..size; return when all are done.
 
     `function` calls a `parallel_kernel` whose output in a range depends on nothing written in another one: then the
-    result is the same for any number of threads.
+    result is the same for any number of threads. `numbers` is how many it computes in all: few are not spread widely.
     """
     from numba import config
 
     # numba's count honours both the process's CPU affinity and NUMBA_NUM_THREADS.
     threads = config.NUMBA_NUM_THREADS
-    count = min(size, threads * _RANGES_PER_THREAD) if threads > 1 else 1
+    count = min(size, threads * _RANGES_PER_THREAD, numbers // _WORTH_A_RANGE) if threads > 1 else 1
     if count <= 1:
         function(0, size)
         return
-    edges = [size * i // count for i in range(count + 1)]
-    futures = [_pool(threads).submit(function, low, high) for low, high in pairwise(edges)]
-    for future in futures:
-        future.result()
+    ranges = iter(list(pairwise(size * i // count for i in range(count + 1))))
+
+    def work() -> None:
+        for low, high in ranges:  # each range goes to one of the threads
+            function(low, high)
+
+    others = [_pool(threads - 1).submit(work) for _ in range(min(threads, count) - 1)]
+    work()
+    for other in others:
+        if not other.cancel():  # one that never began has nothing left to do
+            other.result()

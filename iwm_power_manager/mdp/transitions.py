@@ -18,6 +18,8 @@ from iwm_power_manager.model.two_axles import Speeds, curve_of
 
 #: Newton's method does not start from a car at rest, m/s.
 _SLOW_MPS = 0.05
+#: A step takes as long as some fifty numbers of a sweep.
+_NUMBERS_A_STEP = 50
 
 
 @kernel
@@ -195,14 +197,15 @@ def build_model(problem: Problem, vehicle: VehicleParams, friction: float, deman
     def copy_alike(first: int, last: int) -> None:
         _copy_alike(axes, problem.share.size, vehicle, free_start, free_cell, first, last, *free)
 
-    over_ranges(free_cell.size, fill_free)
-    over_ranges(free_cell.size, copy_alike)
+    pairs = free_cell.size * problem.share.size
+    over_ranges(free_cell.size, _NUMBERS_A_STEP * pairs, fill_free)
+    over_ranges(free_cell.size, pairs, copy_alike)
     gated = empty(gated_cell.size)
 
     def fill_gated(first: int, last: int) -> None:
         _fill_gated(axes, vehicle, params, gated_start, gated_cell, first, last, *gated)
 
-    over_ranges(gated_cell.size, fill_gated)
+    over_ranges(gated_cell.size, _NUMBERS_A_STEP * gated_cell.size, fill_gated)
     return Model(
         problem.discount,
         np.ascontiguousarray(demand, dtype=np.float64),
