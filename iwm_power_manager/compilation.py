@@ -14,13 +14,13 @@ from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numba
-from llvmlite.binding import Linkage
+from llvmlite.binding import Linkage, parse_assembly
 from numba.core import config
 from numba.core.caching import NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.registry import CPUDispatcher
-from numba.core.runtime import rtsys
+from numba.core.runtime import nrtdynmod, rtsys
 from numba.core.serialize import dumps
 from numba.core.types import Array
 from numba.core.types.containers import BaseNamedTuple, BaseTuple
@@ -34,6 +34,32 @@ from iwm_power_manager.kernel_cache import Store, UnknownSourceError
 _NO_WRAPPERS = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 STORE = Store()
+
+
+def _runtime(target: Any) -> Any:
+    """Numba's run time, kept like a kernel: compiling it takes 30 MB that every process would keep to its end."""
+    codegen = target.codegen()
+    depends_on = f"{_compiler()} {codegen.magic_tuple()}"
+    file = f"numba.runtime-{hashlib.sha256(depends_on.encode()).hexdigest()[:32]}"
+    data = STORE.load(file)
+    if data is not None:
+        try:
+            return codegen.unserialize_library(pickle.loads(data))  # noqa: S301 whole, and our own
+        except Exception:  # noqa: BLE001 whatever an unusable file makes of the loader
+            STORE.say_damaged(file)
+    module, library = nrtdynmod.create_nrt_module(target)
+    library.enable_object_caching()
+    library.add_ir_module(module)
+    library.finalize()
+    STORE.save(file, pickle.dumps(library.serialize_using_object_code()))
+    return library
+
+
+nrtdynmod.compile_nrt_functions = _runtime
+
+
+def _compiler() -> str:
+    return f"{kernel_cache.environment()} numba {numba.__version__} llvmlite {version('llvmlite')}"
 
 
 class Use(NamedTuple):
@@ -150,6 +176,16 @@ class _WholeCode(JITCodeLibrary):
                 function.linkage = Linkage.internal
         super()._optimize_final_module()
 
+    def _get_module_for_linking(self) -> Any:
+        """Names only: what no other code is linked with is kept as machine code, which takes far less memory."""
+        module = self._final_module
+        known = [
+            f'@"{value.name}" = global i8 0'
+            for value in itertools.chain(module.functions, module.global_variables)
+            if not value.is_declaration and value.linkage in (Linkage.external, Linkage.common)
+        ]
+        return parse_assembly("\n".join([str(self._codegen._create_empty_module(self.name)), *known]))
+
 
 class _EntryCompiler(Compiler):
     """Numba's compiler, for code that is called from Python only."""
@@ -208,7 +244,7 @@ def key_of(kernel: Kernel, signature: Sequence[Any], processor: Any) -> str:
     if any(not isinstance(cell, Kernel | int | float | str | bool) for cell in cells):
         raise UnknownSourceError(function.__qualname__)
     parts = [
-        f"{kernel_cache.environment()} numba {numba.__version__} llvmlite {version('llvmlite')}",
+        _compiler(),
         repr((processor, config.OPT, config.BOUNDSCHECK, config.USING_SVML, sorted(_options(kernel).items()))),
         f"{function.__module__}.{function.__qualname__} {cells!r}",
         reach.code,

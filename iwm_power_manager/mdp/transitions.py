@@ -69,6 +69,19 @@ def _beyond(now, last):
 
 
 @kernel
+def _first_at_least(ascending, number):
+    """As np.searchsorted, with which numba would load SciPy's linear algebra."""
+    low, high = 0, ascending.size
+    while low < high:
+        middle = (low + high) // 2
+        if ascending[middle] < number:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@kernel
 def _turning_alike(i, slip, speed_mps, axle):
     """Last slip of the axis at which the wheel turns as at the i-th: at rest, wheels that brake all stand."""
     while i + 1 < slip.size and wheel_speed_of_state(slip[i + 1], speed_mps, axle) == wheel_speed_of_state(
@@ -90,7 +103,7 @@ def _first_of_its_kind(state, p, start, cell, speed_mps, slip_front, slip_rear, 
     wanted = v * plane + f * n_r + r
     if wanted == c:
         return state
-    found = start[p] + np.searchsorted(cell[start[p] : start[p + 1]], wanted)
+    found = start[p] + _first_at_least(cell[start[p] : start[p + 1]], wanted)
     return found if found < start[p + 1] and cell[found] == wanted else state
 
 
@@ -103,7 +116,7 @@ def _fill_free(axes, share, vehicle, problem, start, cell, first_state, last_sta
     shortfall = np.empty(n_u)
     curves = (curve_of(problem.friction, vehicle.front), curve_of(problem.friction, vehicle.rear))
     for state in range(first_state, last_state):
-        p = np.searchsorted(start, state, side="right") - 1
+        p = _first_at_least(start, state + 1) - 1
         if _first_of_its_kind(state, p, start, cell, speed_mps, slip_front, slip_rear, vehicle) != state:
             continue
         first = start[p]
@@ -132,7 +145,7 @@ def _fill_free(axes, share, vehicle, problem, start, cell, first_state, last_sta
 def _copy_alike(axes, n_u, vehicle, start, cell, first_state, last_state, cost, corner, fraction):
     _, speed_mps, slip_front, slip_rear = axes
     for state in range(first_state, last_state):
-        p = np.searchsorted(start, state, side="right") - 1
+        p = _first_at_least(start, state + 1) - 1
         source = _first_of_its_kind(state, p, start, cell, speed_mps, slip_front, slip_rear, vehicle)
         if source != state:
             first = start[p]
@@ -152,7 +165,7 @@ def _fill_gated(axes, vehicle, problem, start, cell, first_state, last_state, co
     plane = slip_front.size * n_r
     curves = (curve_of(problem.friction, vehicle.front), curve_of(problem.friction, vehicle.rear))
     for state in range(first_state, last_state):
-        p = np.searchsorted(start, state, side="right") - 1
+        p = _first_at_least(start, state + 1) - 1
         c = cell[state]
         v, f, r = speed_mps[c // plane], slip_front[c // n_r % slip_front.size], slip_rear[c % n_r]
         guess = _rolling_guess(power_w[p], v, vehicle, problem)
