@@ -54,6 +54,8 @@ def car(start_pair: Any) -> RollingCar:
 
 def braking_share(car: RollingCar) -> float:
     """Braking torque that is commanded, as part of what is asked for at the speed the car has."""
+    if not (car.motors and car.brakes):
+        return 0.0  # the car has not heard a command yet
     commanded = car.motors[-1].torque_nm + car.brakes[-1].torque_nm
     return commanded / (BRAKE_W / car.speed_mps * RADIUS_M)
 
