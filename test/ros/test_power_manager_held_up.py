@@ -36,7 +36,7 @@ class Hold(NamedTuple):
 def hold(car: RollingCar, process_id: int, length_s: float, phase_s: float, brakes: bool) -> Hold:
     """Drive, stop the process, and drive on or brake from that moment; returns when it drives again."""
     bench = car.bench
-    car.roll(lambda: bench.mode() == 1 and car.motors[-1].torque_nm > 100.0, "torque", lambda: DRIVE_W)
+    car.roll(lambda: bench.mode() == 1 and car.motors and car.motors[-1].torque_nm > 100.0, "torque", lambda: DRIVE_W)
     due = time.monotonic() + phase_s
     car.roll(lambda: time.monotonic() >= due, "the moment", lambda: DRIVE_W)
     after_w = BRAKE_W if brakes else DRIVE_W
