@@ -140,6 +140,16 @@ def test_each_wheel_that_slips_tells_of_its_own_side(wheel):
     # The forces of the others are reckoned with all the wheels, so it is a little off.
     assert here.friction == pytest.approx(0.2, abs=0.08)
     assert (here.confidence, there.friction > 0.7) == (1.0, True)
+    assert grip.assumed == pytest.approx(here.friction, abs=0.04)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_wheels_that_are_alike_make_no_sides_alike_that_are_not(side):
+    drive = Drive()
+    grip = drive.state.friction
+    drive.state = drive.state._replace(friction=grip._replace(**{side: grip.left._replace(friction=0.2)}))
+    after = drive.step((0.9,) * 4, 0.0)
+    assert [getattr(after, name).friction < 0.3 for name in ("left", "right")] == [side == "left", side == "right"]
 
 
 def test_it_rises_at_its_rate_and_no_single_point_raises_it_by_more():
@@ -160,6 +170,40 @@ def test_friction_in_use_is_a_lower_bound():
     for _ in range(100):
         grip = drive.step((0.9,) * 4, -0.25)
     assert grip.left.friction >= 0.24
+
+
+@pytest.mark.parametrize("what", ["torque", "speed", "memory", "road force"])
+@pytest.mark.parametrize("wheel", range(4))
+def test_what_is_unlike_at_one_wheel_is_reckoned_for_that_wheel(wheel, what):
+    drive = Drive()
+    drive.gently(0.9, 3)
+    state, radps = drive.state, [drive.speed / RADIUS] * 4
+
+    def reckoned(**unlike):
+        wheels, rims, grips = list(state.wheels), list(radps), list(state.friction.wheels)
+        if unlike:
+            wheels[wheel] = wheels[wheel]._replace(
+                total_nm=wheels[wheel].total_nm + 20.0 * (what == "torque"),
+                road_nm=wheels[wheel].road_nm + 200.0 * (what == "road force"),
+            )
+            rims[wheel] += 0.1 * (what == "speed")
+            grips[wheel] = grips[wheel]._replace(used=grips[wheel].used + 0.1 * (what == "memory"))
+        before = state.friction._replace(wheels=tuple(grips))
+        return estimate(before, tuple(wheels), tuple(rims), drive.speed, True, False, DT, SETTINGS, CAR).wheels
+
+    unlike = [a != b for a, b in zip(reckoned(), reckoned(unlike=True), strict=True)]
+    # The loads go by the forces of all four.
+    assert unlike == [i == wheel or what == "road force" for i in range(4)]
+
+
+@pytest.mark.parametrize("wheel", range(4))
+def test_friction_in_use_at_one_wheel_is_that_of_its_side(wheel):
+    drive = Drive(SETTINGS._replace(friction_prior=0.1))
+    grip = drive.state.friction
+    wheels = tuple(one._replace(used=0.5 if i == wheel else 0.0) for i, one in enumerate(grip.wheels))
+    drive.state = drive.state._replace(friction=grip._replace(wheels=wheels))
+    after = drive.step((0.9,) * 4, 0.0)
+    assert [after.left.friction > 0.1, after.right.friction > 0.1] == [wheel % 2 == 0, wheel % 2 == 1]
 
 
 def test_at_rest_it_goes_back_to_the_prior_slowly():
