@@ -143,6 +143,15 @@ def test_each_wheel_that_slips_tells_of_its_own_side(wheel):
     assert grip.assumed == pytest.approx(here.friction, abs=0.04)
 
 
+@pytest.mark.parametrize("friction", [(0.2, 0.2, 0.9, 0.9), (0.9, 0.9, 0.2, 0.2)])
+def test_an_axle_that_slips_tells_it_of_both_sides(friction):
+    drive = Drive()
+    for _ in range(15):
+        grip = drive.step(friction, -0.5)
+    assert grip.left == grip.right
+    assert grip.right.confidence == 1.0
+
+
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_wheels_that_are_alike_make_no_sides_alike_that_are_not(side):
     drive = Drive()
