@@ -36,7 +36,7 @@ from iwm_sim.study.policies import solved
 from iwm_sim.study.rows import rows_of
 
 #: Of a processor, for a unit of `effort`; to fill batches, no promise.
-_SECONDS_PER_EFFORT = 2.5e-6
+_SECONDS_PER_EFFORT = 1e-6
 _SECONDS_PER_POLICY = 10.0
 _SECONDS_PER_SCENARIO = 2.0
 
