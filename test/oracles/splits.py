@@ -93,15 +93,16 @@ def bellman(point, previous, table, outcome, used=0.0, steps=1.0):
     """Cost of each share: step, change, and what follows (eq. 31). `outcome(share)` is the step's (cost, v, f, r).
 
     `used` is what is used of the budget of changes: the tables at dearer prices count for more, the more that is.
-    `steps` is how many times the step counts. With a budget half of eq. 31 is believed; for the other half the step's
-    cost goes on for 0.6 s.
+    `steps` is how many times the step counts. With a budget half of eq. 31 is believed, driving; for the other half
+    the step's cost goes on for 0.6 s.
     """
     axes = (table.power_w, table.speed_mps, table.slip_front, table.slip_rear, table.previous_share)
     budget = table.changes_per_min
     tables, level, factor, trust = [table.expected_cost_j, *table.dearer_cost_j], 0.0, 1.0, 1.0
     if budget > 0.0:
-        trust = 0.5
-        steps += 0.5 * (0.6 / table.problem.dt_s - 1.0)
+        if point[0] > 0.0:
+            trust = 0.5
+            steps += 0.5 * (0.6 / table.problem.dt_s - 1.0)
         full = max(2.0 * budget, 2.0)
         factor = 20.0 ** min(used / full, 1.0)
         level = min(math.log(factor, 3.0), 2.0)
