@@ -2,10 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """How fast the solver and the closed loop are: beside their peers, beside an earlier checkout, and how exact.
 
-Every row is a process of its own: a warm-up (compiling, caches), then the timed runs; its peak memory is its own. Times
-are of the processor, summed over the threads, so that another busy process tells in the spread but not in the median.
-`--before FOLDER` runs an earlier checkout of this package in turns; `--fastsim PYTHON` an interpreter that has the
-packages of benchmarks/requirements.txt; `--page FILE` puts the table between that page's markers.
+Every row is a process of its own, after one that compiles: a warm-up, then the timed runs; its peak memory is its own.
+Times are of the processor, summed over the threads, so that another busy process tells in the spread but not in the
+median, and on the clock. `--before FOLDER` runs an earlier checkout of this package in turns; `--fastsim PYTHON` an
+interpreter that has the packages of benchmarks/requirements.txt; `--page FILE` puts the table between that page's
+markers.
 """
 
 from __future__ import annotations
@@ -266,9 +267,10 @@ CHILDREN: dict[str, Callable[[int], dict[str, Any]]] = {
 
 def measured(name: str, repeat: int, checkout: Path) -> dict[str, Any]:
     """One row in a process of its own, with the code of a checkout."""
-    command = [sys.executable, "-P", __file__, "--child", name, "--repeat", str(repeat)]
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
-    made = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
+    for times in (1, repeat):  # what the first one may have to compile takes memory, too
+        command = [sys.executable, "-P", __file__, "--child", name, "--repeat", str(times)]
+        made = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
     return dict(json.loads(made.stdout.splitlines()[-1]))
 
 
