@@ -191,6 +191,12 @@ def recorded_mapping(chosen: str | None, custom_data: Mapping[str, str]) -> Sign
     return mapping.with_wheel_names(_wheel_names(recorded.get("wheel_names"))) if standard else mapping
 
 
+def unknown_mapping(custom_data: Mapping[str, str]) -> str:
+    """The signals file the drive was recorded with, where it is none of the package's; else ""."""
+    name = str(recorded_parameters(custom_data).get("signals_file", ""))
+    return "" if _packaged(name) else name
+
+
 def recorded_parameters(custom_data: Mapping[str, str]) -> dict[str, Any]:
     """Parameters the bag's power manager ran with, whatever its name was; empty if the bag does not say."""
     nodes = sorted(custom_data.items(), key=lambda item: (not item[0].endswith(_NODE), item))

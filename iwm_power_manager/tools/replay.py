@@ -26,7 +26,7 @@ from iwm_power_manager.control.strategies import drivable, name_of
 from iwm_power_manager.errors import BagError, ConfigError, IwmError, one_line
 from iwm_power_manager.files import atomic_write, check_number
 from iwm_power_manager.replay.commands import command_topics
-from iwm_power_manager.replay.plan import Choice, Plan, make_plan, recorded_mapping
+from iwm_power_manager.replay.plan import Choice, Plan, make_plan, recorded_mapping, unknown_mapping
 from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds, state_topic
 from iwm_power_manager.replay.what_if import Consumption, what_if
 from iwm_power_manager.tools.command import DONE, described, ended
@@ -196,6 +196,10 @@ def _publish(options: argparse.Namespace) -> int:
     from iwm_power_manager.ros.player import PlayOptions, play
 
     with BagReader(options.bag) as bag:
+        unknown = unknown_mapping(bag.custom_data)
+        if unknown and not options.mapping and not options.topics:
+            text = "does not say which topics are the car's commands, which a replay must not send"
+            raise ConfigError(bag.path, "", text, f"with --mapping {unknown[:200]!r}, or by name with --topics")
         return play(
             bag,
             PlayOptions(

@@ -76,7 +76,7 @@ def test_the_room_is_the_road_s_torque_and_what_turns_the_wheel_to_its_target(br
     room = torque_room_nm(
         braking, road, wheel, speed, s.slip_target, s.slip_limiter_s, s.slip_speed_floor_mps, RADIUS, INERTIA
     )
-    expected = oracle.grip(braking, road, wheel, speed, s, AXLE)
+    expected = oracle.grip(braking, road, wheel, speed, s.slip_target, s, AXLE)
     if math.isinf(expected):
         assert room == UNLIMITED_NM
     else:

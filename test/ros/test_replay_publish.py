@@ -194,6 +194,21 @@ def test_an_unknown_topic_is_named(tmp_path: Path, start: Callable[..., subproce
     assert error.startswith(f"replay: error: {inputs}: holds no topic /nope; it holds /battery_state, ")
 
 
+def test_a_drive_with_a_signals_file_of_its_own_is_not_played_without_it(
+    tmp_path: Path, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    drive = ScriptedDrive("equal")
+    drive.parameters = {**drive.parameters, "signals_file": "my_signals.yaml"}
+    bag = drive.write(tmp_path / "drive", 5, state=False, commands=False)
+    player = start("tools.replay", str(bag), "--publish")
+    out, error = player.communicate(timeout=PATIENCE_S)
+    assert player.returncode == 2
+    assert out == ""
+    assert "--mapping 'my_signals.yaml'" in error
+    out, _ = end(start("tools.replay", str(bag), "--publish", "--rate", "1000", "--mapping", "standard"), None)
+    assert "published" in out
+
+
 def clocked(path: Path, clock_ns: Callable[[int], int], *more: foreign.Channel) -> Path:
     """A bag of a drive with a /clock beside, and one message of each further channel."""
     clock = foreign.Channel("/clock", "rosgraph_msgs/msg/Clock", "builtin_interfaces/Time clock\n")
