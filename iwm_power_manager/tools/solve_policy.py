@@ -166,8 +166,8 @@ def _solve(options: argparse.Namespace) -> int:
             solved.append(solve_one(problem, vehicle, friction, chain, sources, path, progress.update, options.verify))
         say(_convergence_text(solved[-1]))
     if options.export_mdp:
-        solved_problem = problem.on_road(frictions[0])
-        export_mdp(build_model(solved_problem, vehicle.params, frictions[0], chain.matrix), options.export_mdp)
+        priced = solved[0].policy.problem  # with the price of a change that was found
+        export_mdp(build_model(priced, vehicle.params, frictions[0], chain.matrix), options.export_mdp)
         say(f"problem: {options.export_mdp}")
     if options.plot:
         from iwm_power_manager.tools.solver_figures import draw_solution

@@ -160,7 +160,9 @@ def _settings(options: argparse.Namespace) -> law_settings.Settings:
             f"{settings.decision_period_s:g} s is shorter than the control step",
             f"at least --dt {options.dt:g} s",
         )
-    target = min(settings.slip_target, 0.75 * settings.critical_slip)  # the limiter works in front of the gate
+    target = settings.slip_target
+    if target >= settings.critical_slip:  # of a gate set closer than usual; the limiter works in front of it
+        target = 0.75 * settings.critical_slip
     settings = settings._replace(slip_target=target, decision_period_s=max(settings.decision_period_s, options.dt))
     problem = law_settings.check_together(settings._asdict())
     if problem:

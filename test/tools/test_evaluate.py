@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
 from iwm_sim.study import variants
 from iwm_sim.study.content import Study
@@ -56,6 +57,15 @@ def test_all_combinations_are_driven_and_short_names_resolve(tmp_path):
     )
     seen = [(row["friction"], row["idle_drive"], row["strategy"]) for row in rows_of(out)]
     assert len(seen) == len(set(seen)) == 8
+
+
+def test_a_cycle_is_driven_with_the_settings_that_the_node_has(hill, tmp_path):
+    out = tmp_path / "out.json"
+    assert evaluate.main(["--cycle", str(hill), "--strategy", "equal", "--json", str(out), "--quiet"]) == 0
+    settings = rows_of(out)[0]["settings"]
+    assert {name: settings[name] for name in ("slip_target", "critical_slip", "gate_hysteresis")} == {
+        name: getattr(DEFAULTS, name) for name in ("slip_target", "critical_slip", "gate_hysteresis")
+    }
 
 
 def test_law_settings_reach_the_law(hill, tmp_path):
