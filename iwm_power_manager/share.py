@@ -19,7 +19,7 @@ from iwm_power_manager.errors import ConfigError
 PACKAGE = "iwm_power_manager"
 
 #: How much alike names have to be, 0..1, for one to be taken for a slip of the other.
-_NEAR = 0.75
+_NEAR = 0.7
 
 
 def roots() -> list[Path]:

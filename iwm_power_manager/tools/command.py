@@ -42,8 +42,12 @@ def ended(name: str, work: Callable[[], int | None]) -> int:
 
 
 def write_json(path: Path | str, values: Any) -> None:
-    """Write plain values as JSON, atomically."""
-    atomic_write(path, (json.dumps(values, indent=1, allow_nan=False) + "\n").encode())
+    """Write plain values as JSON, atomically; to standard output, where the file is called -."""
+    text = json.dumps(values, indent=1, allow_nan=False)
+    if str(path) == "-":
+        print(text)
+    else:
+        atomic_write(path, (text + "\n").encode())
 
 
 #: Endings of a picture's name, and what would make its bytes differ from run to run or say who drew it.

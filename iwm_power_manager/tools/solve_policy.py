@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from tqdm import tqdm
 from iwm_power_manager import __version__
 from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import atomic_write, check_number
+from iwm_power_manager.files import check_number
 from iwm_power_manager.mdp.certify import bellman_bound
 from iwm_power_manager.mdp.demand import (
     THIN_ROW_STEPS,
@@ -41,7 +40,7 @@ from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.demand import drive_source, read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
-from iwm_power_manager.tools.command import described, ended, picture
+from iwm_power_manager.tools.command import described, ended, picture, write_json
 from iwm_power_manager.tools.options import several
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
@@ -122,7 +121,7 @@ def parser() -> argparse.ArgumentParser:
     output = result.add_argument_group("output")
     output.add_argument("--output", metavar="DIR|FILE", help="folder for the policies, or a .npz file for a single one")
     output.add_argument("--plot", type=picture, metavar="PICTURE", help="demand, convergence, policy: .pdf, .png, .svg")
-    output.add_argument("--json", metavar="FILE", help="the run's numbers")
+    output.add_argument("--json", metavar="FILE", help="the run's numbers; - for standard output")
     output.add_argument(
         "--export-mdp", metavar="NPZ", help="the exact problem, for another solver (one friction; docs/solver.md)"
     )
@@ -175,7 +174,7 @@ def _solve(options: argparse.Namespace) -> int:
         draw_solution([result.policy for result in solved], options.plot)
         say(f"picture: {options.plot}")
     if options.json:
-        atomic_write(options.json, json.dumps(_numbers(chain, sources, solved), indent=1).encode())
+        write_json(options.json, _numbers(chain, sources, solved))
     return SOLVED if all(result.policy.converged for result in solved) else UNSOLVED
 
 

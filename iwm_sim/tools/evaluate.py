@@ -197,7 +197,7 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--json",
         metavar="FILE",
-        help="a row for each case, with settings and hashes; or what was asked for instead",
+        help="a row for each case, with settings and hashes; or what was asked for instead; - for standard output",
     )
     group.add_argument("--save-series", metavar="DIR", help="a .npz for each case, with an array for each signal")
     group.add_argument("--quiet", action="store_true", help="no progress, no table")

@@ -68,6 +68,11 @@ def test_a_cycle_is_driven_with_the_settings_that_the_node_has(hill, tmp_path):
     }
 
 
+def test_json_goes_to_standard_output_where_it_is_asked_to(hill, capsys):
+    assert evaluate.main(["--cycle", str(hill), "--strategy", "equal", "--json", "-", "--quiet"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"][0]["strategy"] == "equal"
+
+
 def test_law_settings_reach_the_law(hill, tmp_path):
     out = tmp_path / "out.json"
     law = ["--gate-mode", "table2", "--no-gate-driving", "--switching-power", "5", "--critical-slip", "0.1"]
