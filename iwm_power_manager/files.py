@@ -40,6 +40,7 @@ MAX_LINE_LENGTH = 4096
 
 _BLOCK = 2**20
 _NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?", re.ASCII)
+_BARE_INDEX = re.compile(r"[^\W\d]\w*\[\d+\](?![\w.]*[\"'])")
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 
 
@@ -241,7 +242,9 @@ def read_yaml(path: Path | str) -> dict[str, Any]:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"line {mark.line + 1}" if mark else ""
-        raise ConfigError(path, where, " ".join((error.problem or "is no YAML").split())) from None
+        line = "".join(text.split("\n")[mark.line : mark.line + 1]) if mark else ""
+        hint = "; quote a text with [ ]" if _BARE_INDEX.search(line) else ""
+        raise ConfigError(path, where, " ".join((error.problem or "is no YAML").split()) + hint) from None
     except Exception as error:  # noqa: BLE001 - PyYAML's constructors fail in many ways: !!bool maybe is a KeyError
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(path, "", f"is no YAML: {reason}") from None

@@ -82,6 +82,7 @@ def test_a_missing_folder_is_a_clear_error(tmp_path):
         ("", "holds no mapping"),
         ("1: 2\n", "1: is no text key"),
         ("a: 2020-13-45\n", "is no YAML"),
+        ("a: 1\nb: {topic: x, field: data[2]}\n", "line 2: expected ',' or '}', but got '['; quote a text with [ ]"),
         ("a: !!python/object/apply:os.system [ls]\n", "could not determine a constructor"),
     ],
 )

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -86,28 +87,36 @@ def read_commands(file: Path, content: Any) -> dict[str, tuple[Sink, ...]]:
     return found
 
 
-def _base(file: Path, key: str, entry: Any, more: list[str]) -> tuple[Mapping[str, Any], float]:
+def _base(file: Path, key: str, entry: Any, more: list[str]) -> Mapping[str, Any]:
     values = check_keys(file, entry, ["topic", "type", "field", "unit"], ["factor", "sign", *more], key)
     for name in ("topic", "type", "field"):
         if not isinstance(values[name], str) or not values[name]:
             raise ConfigError(file, dotted(key, name), f"{values[name]!r} is no name")
     check_choice(file, dotted(key, "unit"), values["unit"], _UNITS)
-    factor = check_number(file, dotted(key, "factor"), values.get("factor", 1.0))
-    if factor == 0.0:
-        raise ConfigError(file, dotted(key, "factor"), "0 is not allowed", "a number that is not 0")
-    return values, factor
+    return values
+
+
+def _factors(file: Path, key: str, factor: Any, *, wheels: bool) -> tuple[float, ...]:
+    """A factor, or where wheels have one each, four; `ConfigError` for anything else."""
+    found = factor if wheels and isinstance(factor, list) and len(factor) == _WHEELS else [factor]
+    numbers = tuple(check_number(file, key, one) for one in found)
+    if 0.0 in numbers:
+        raise ConfigError(file, key, "0 is not allowed", "a number that is not 0" + (", or four" if wheels else ""))
+    return numbers
 
 
 def _one(file: Path, key: str, entry: Any, wheel: int) -> Sink:
-    values, factor = _base(file, key, entry, [])
+    values = _base(file, key, entry, [])
+    (factor,) = _factors(file, dotted(key, "factor"), values.get("factor", 1.0), wheels=False)
     (sign,) = signs(file, dotted(key, "sign"), values.get("sign", 1), wheels=False)
     return Sink(key, values["topic"], values["type"], values["field"], (factor * sign,), (wheel,))
 
 
 def _all(file: Path, key: str, entry: Any) -> Sink:
-    values, factor = _base(file, key, entry, ["names", "order"])
+    values = _base(file, key, entry, ["names", "order"])
+    factor = _factors(file, dotted(key, "factor"), values.get("factor", 1.0), wheels=True)
     sign = signs(file, dotted(key, "sign"), values.get("sign", 1), wheels=True)
-    factors = tuple(factor * one for one in (sign * _WHEELS if len(sign) == 1 else sign))
+    factors = tuple(a * b for a, b in zip(cycle(factor), sign * _WHEELS if len(sign) == 1 else sign, strict=False))
     names = wheel_names(file, dotted(key, "names"), values["names"]) if "names" in values else ()
     order = values.get("order", list(WHEEL_NAMES))
     if not isinstance(order, list) or sorted(map(str, order)) != sorted(WHEEL_NAMES):

@@ -53,6 +53,17 @@ def test_an_array_has_its_own_order_factor_and_signs(tmp_path: Path) -> None:
     assert (topic, list(found.data)) == ("a", [-8.0, 2.0, 4.0, 7.0])
 
 
+def test_wheels_of_an_array_may_have_a_factor_each(tmp_path: Path) -> None:
+    write = writer(
+        tmp_path,
+        "{topic: a, type: std_msgs/msg/Float64MultiArray, field: data, unit: N m, factor: [1, 2, 4, 8], sign: -1,"
+        " order: [rear_right, front_left, front_right, rear_left]}",
+    )[MOTOR]
+    ((_, data),) = write(0, TORQUES)
+    found = deserialize_message(data, messages.message_class("std_msgs/msg/Float64MultiArray"))
+    assert list(found.data) == [-32.0, -1.0, 4.0, -14.0]
+
+
 def test_names_follow_the_order_of_the_array(tmp_path: Path) -> None:
     write = writer(
         tmp_path,
@@ -84,6 +95,8 @@ def test_four_topics_carry_a_wheel_each_and_none_carries_nothing(tmp_path: Path)
         ("{topic: a, type: nobody_msgs/msg/None, field: data, unit: N m}", "commands.motor_torque.type"),
         ("{topic: a, type: std_msgs/msg/Float64MultiArray, field: data, unit: Nm}", "'Nm' is unknown; allowed: N m"),
         ("{topic: a, type: std_msgs/msg/Float64MultiArray, field: data, unit: N m, factor: 0}", "0 is not allowed"),
+        ("{topic: a, type: std_msgs/msg/Float64MultiArray, field: data, unit: N m, factor: [1, 2]}", "factor"),
+        ("[{topic: a, type: std_msgs/msg/Float64, field: data, unit: N m, factor: [1, 2, 4, 8]}, b, c, d]", "factor"),
         (
             "{topic: a, type: std_msgs/msg/Float64MultiArray, field: data, unit: N m, order: [rear_left]}",
             "allowed: an order of front_left, front_right, rear_left, rear_right",
