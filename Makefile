@@ -27,10 +27,10 @@ policies: setup-run  ## Solve the shipped policies again, the same tables come o
 	@for idle in drag none; do $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml --idle-drive $$idle \
 	  $(CYCLES) --friction 0.9 0.5 0.2 --grid coupled --output policies $(ARGS) || exit $$?; done
 
-study: setup-run  ## All tables and figures of the paper, and what beats them (10 min)
+study: setup-run  ## All tables and figures of the paper, and what beats them (3 min)
 	@$(BIN)/evaluate --study runs/study $(ARGS)
 
-unseen: setup-run  ## Our strategy on cycles and cars that were not there when it was made (says how long)
+unseen: setup-run  ## Our strategy on cycles and cars that were not there when it was made (shows how far)
 	@$(BIN)/evaluate --unseen runs/unseen $(ARGS)
 
 roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required (4 min)

@@ -32,7 +32,7 @@ def on_all_cores(
     function: Callable[[Item], Made],
     items: Sequence[Item],
     jobs: int,
-    done: Callable[[Made], None] = lambda _: None,
+    done: Callable[[Made], object] = lambda _: None,
 ) -> list[Made]:
     """`[function(item) for item in items]`, on `jobs` processes; `done` hears of each as it is ready.
 

@@ -34,7 +34,7 @@ from iwm_sim.study import (
     unseen,
 )
 from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result, SensorNoise
-from iwm_sim.study.driving import Progress, drive_all, on_all_cores, silent, tell, warm_up, with_rules
+from iwm_sim.study.driving import Progress, drive_all, on_all_cores, progress_of, silent, tell, warm_up, with_rules
 from iwm_sim.study.names import REFERENCE
 from iwm_sim.study.plan import Policies
 from iwm_sim.study.policies import PolicySource
@@ -337,11 +337,9 @@ def _unseen(options: argparse.Namespace) -> None:
         raise ConfigError("arguments", "--unseen", "has neither cycles nor cars", "--cycles or --cars")
     say = silent if options.quiet else tell
     started = time.perf_counter()
-    made = [unseen.drive_cell(wanted[0])]
-    each_s = time.perf_counter() - started
-    rest_min = each_s * (len(wanted) - 1) / options.jobs / 60.0
-    say(f"{len(wanted)} cells from seed {options.seeds} on; by the first, at most about {rest_min:.0f} min")
-    made += on_all_cores(unseen.drive_cell, wanted[1:], options.jobs)
+    say(f"{len(wanted)} cells from seed {options.seeds} on; policies for cars of their own are solved first")
+    with progress_of(len(wanted), "cell", options.quiet) as bar:
+        made = on_all_cores(unseen.drive_cell, wanted, options.jobs, lambda _: bar.update())
     atomic_write(folder / "unseen.json", unseen.to_json(made))
     frontier_figure.draw_margins(made, folder / "margins.svg")
     text = unseen.report(made)
