@@ -12,16 +12,13 @@ from iwm_power_manager.control.controller import Controller
 from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import BATTERY, DEMAND, FRICTION, SPEED, WHEELS
 from iwm_power_manager.control.supervision import MODE_DEGRADED, MODE_NORMAL, MODE_WAITING, STALE_NAMES
-from iwm_power_manager.nodes.preparation import COMPILING_S, Prepared
+from iwm_power_manager.nodes.preparation import SLOW_S, Prepared
 from iwm_power_manager.signals import mapping
 
 #: What the node waits for is said again after this time.
 REPEAT_S = 5.0
 #: A car that starts or dies changes what is there several times within this time.
 SETTLED_S = 0.9
-
-#: What there is to say of an input that is back already.
-_FOR_A_MOMENT = "an input came late; is input_period_s the period your stack has?"
 
 #: Which of the controller's inputs a signal is.
 _INPUTS = (
@@ -53,6 +50,7 @@ class Announcements:
         self._said: dict[str, float] = {}
         self._problems: set[str] = set()
         self._found_s: dict[str, float] = {}
+        self._values: Mapping[str, Any] = {}
         self.activated()
 
     def activated(self) -> None:
@@ -61,19 +59,21 @@ class Announcements:
         self._stale = 0
         self._was_degraded = False
         self._torque_seen = False
+        self._late_s: dict[str, float] = {}
         self._said.clear()
         self._said["waiting"] = time.monotonic() - REPEAT_S + 1.0  # inputs get a second to come before
 
     def preparing(self, elapsed_s: float) -> None:
         """Tell that it takes long, again and again."""
-        if elapsed_s > COMPILING_S and self._due("compiling"):
-            self._logger.info(f"preparing for {elapsed_s:.0f} s so far: what the cache does not hold is compiled")
+        if elapsed_s > SLOW_S and self._due("preparing"):
+            self._logger.info(f"preparing for {elapsed_s:.0f} s so far; minutes only where precompile was not run")
 
     def prepared(self, prepared: Prepared) -> None:
         """Tell what was loaded."""
         vehicle, policies = prepared.vehicle, prepared.policies
-        if prepared.elapsed_s > COMPILING_S:
-            self._logger.info(f"prepared in {prepared.elapsed_s:.1f} s")
+        self._values = prepared.values
+        if prepared.elapsed_s > SLOW_S or prepared.compiled:
+            self._logger.info(f"prepared in {prepared.elapsed_s:.1f} s, {prepared.compiled or 'no'} kernels compiled")
         self._logger.info(f"vehicle {vehicle.name} ({vehicle.hash[:12]}); {policies.description()}")
         if policies.fallback_reason:
             self._logger.warning(
@@ -128,22 +128,38 @@ class Announcements:
         now_ns : the node's clock
         """
         mode, stale = controller.supervision.mode, controller.supervision.stale
-        if not self._torque_seen and controller.command and any(controller.command.motor_torque_nm):
-            self._torque_seen = True
-            self._logger.info(f"first torque: {sum(controller.command.motor_torque_nm):.1f} N m over all wheels")
         if mode == MODE_WAITING and self._due("waiting"):
             waits = self._missing(controller, topics, trouble, ~0, now_ns)
             if waits:
                 self._logger.info(f"waits for {waits}")
         if (mode == MODE_DEGRADED and mode != self._mode) or (stale & ~self._stale and mode == MODE_DEGRADED):
-            missing = self._missing(controller, topics, trouble, stale, now_ns) or _FOR_A_MOMENT
+            missing = self._missing(controller, topics, trouble, stale, now_ns) or self._was_late()
             self._logger.warning(f"degraded, motor torque fades: {missing}")
         elif mode == MODE_NORMAL and mode != self._mode:
             self._logger.info(f"{'recovered' if self._was_degraded else 'all inputs are there'}: normal operation")
         if mode == MODE_NORMAL:
+            self._late_s.clear()
+            if not self._torque_seen and controller.command and any(controller.command.motor_torque_nm):
+                self._torque_seen = True
+                self._logger.info(f"first torque: {sum(controller.command.motor_torque_nm):.1f} N m over all wheels")
             self._lost_wheels(controller, wheel_names)
         self._was_degraded |= mode == MODE_DEGRADED
         self._mode, self._stale = mode, stale
+
+    def late(self, stale: int, ages_s: Sequence[float]) -> None:
+        """Remember how old the inputs were in a step that missed some of them."""
+        for (bit, name), age_s in zip(STALE_NAMES.items(), ages_s, strict=True):
+            if stale & bit:
+                self._late_s[name] = age_s
+
+    def _was_late(self) -> str:
+        """What there is to say of inputs that are back already."""
+        missed = self._values.get("missed_periods")
+        return ", ".join(
+            f"{name} was {age_s:.3f} s old (input_period_s {self._values[f'input_period_s.{name}']:g}, "
+            f"missed_periods {missed})"
+            for name, age_s in self._late_s.items()
+        )
 
     def _lost_wheels(self, controller: Controller, wheel_names: Sequence[str]) -> None:
         for name, verdict in zip(wheel_names, controller.monitor.verdicts, strict=True):

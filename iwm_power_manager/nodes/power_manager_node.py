@@ -301,6 +301,8 @@ class PowerManager(Starting):
             if self._answer is not None:
                 self._outputs.publish(self._answer)
             return
+        if self._controller is not None and (stale := self._controller.supervision.stale):
+            self._says.late(stale, self._controller.monitor.ages_s(taken.stamp_ns))
         self._answer = self._outputs.answer(taken.stamp_ns, taken.step)
         if isinstance(self._stepper, RealTime):
             if not self._outputs.publish(self._answer, self._stepper.may_send):
@@ -429,6 +431,6 @@ class PowerManager(Starting):
         if self._active and self._inputs is not None and self._outputs is not None:
             found = neighbours.look(self, self._inputs, self._outputs)
             self._unheard = found.unheard
-            self._says.problems(found.problems)
+            self._says.problems([*found.problems, *self._report.doubts])
             statuses += found.statuses
         return statuses

@@ -14,9 +14,17 @@ from iwm_power_manager.control.supervision import Supervision
 from iwm_power_manager.control.types import GATE_NONE, LIMIT_NAMES, Command
 from iwm_power_manager.ros import diagnostics
 
+#: Fewer steps since the last report do not say whether a sensor is believed.
+_FEW_STEPS = 5
+
 
 class PowerManagerReport:
-    """Counts steps, gates and limits; turns them and the node's present state into diagnostics."""
+    """Counts steps, gates and limits; turns them and the node's present state into diagnostics.
+
+    Attributes
+    ----------
+    doubts : what the last report said of sensors that are not believed, for the log
+    """
 
     def __init__(self, node_name: str, wheel_names: Sequence[str], rate_hz: float | None) -> None:
         self._node_name = node_name
@@ -27,6 +35,7 @@ class PowerManagerReport:
         self._activity: Counter[str] = Counter()
         self._steps = 0
         self._doubted: Counter[int] = Counter()
+        self.doubts: list[str] = []
 
     def note_step(self, command: Command, period_s: float | None, execution_s: float) -> None:
         """Count one step of the active node."""
@@ -78,7 +87,10 @@ class PowerManagerReport:
                     self._wheel_names,
                 )
             )
-            statuses.append(diagnostics.sensors_status(self._doubted, self._steps, self._wheel_names))
+            sensors = diagnostics.sensors_status(self._doubted, self._steps, self._wheel_names)
+            if self._steps >= _FEW_STEPS:
+                self.doubts = [sensors.message] if sensors.level != diagnostics.OK else []
+            statuses.append(sensors)
             statuses.append(diagnostics.motors_status(controller.actuators, self._wheel_names))
             statuses.append(self._loop.report(self._rate_hz, values))
         self._activity.clear()

@@ -27,8 +27,8 @@ from iwm_power_manager.signals.readings import Assembly, TopicReader, topic_read
 from iwm_power_manager.signals.types import types_of
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
-#: Preparing takes longer than this only where the law has to be compiled.
-COMPILING_S = 3.0
+#: Preparing that takes longer than this is said.
+SLOW_S = 3.0
 
 
 class Prepared(NamedTuple):
@@ -42,6 +42,7 @@ class Prepared(NamedTuple):
     readers : by topic
     commands : writer of each command
     elapsed_s : time it took
+    compiled : kernels that the cache did not hold
     """
 
     values: Mapping[str, Any]
@@ -52,6 +53,7 @@ class Prepared(NamedTuple):
     readers: dict[str, TopicReader]
     commands: dict[str, CommandWriter]
     elapsed_s: float
+    compiled: int
 
 
 def prepare(values: Mapping[str, Any]) -> Prepared:
@@ -89,8 +91,11 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
     controller.policy = table
     controller.table_of = policies.table if estimated else None
     controller.reset()
+    from iwm_power_manager.compilation import USES  # the warm law has imported it; nobody waits for it before
+
+    compiled = sum(not use.found for use in USES)
     elapsed_s = time.monotonic() - started_s
-    return Prepared(values, vehicle, policies, controller, mapping, readers, commands, elapsed_s)
+    return Prepared(values, vehicle, policies, controller, mapping, readers, commands, elapsed_s, compiled)
 
 
 def _interface(

@@ -225,12 +225,17 @@ def test_a_motor_that_reports_no_torque_is_found_and_left_out(start_pair) -> Non
 
 
 def test_wheel_speeds_in_another_unit_are_named(start_pair) -> None:
-    bench = start_pair().bench
+    pair = start_pair()
+    bench = pair.bench
     bench.connect()
     bench.drive(lambda: bench.mode() == 1 and bench.status("sensors").level == DiagnosticStatus.OK, "believed sensors")
     rpm_as_radps = (10.0 / 0.33 * 9.55,) * 4
     bench.drive(lambda: bench.status("sensors").level != DiagnosticStatus.OK, "the reason", wheels=rpm_as_radps)
     assert "not believed: contradicts the others" in bench.status("sensors").message
+    said = "not believed: contradicts the others; right unit and scale?"
+    log = pair.running.text
+    bench.drive(lambda: said in log(), "the same in the log", wheels=rpm_as_radps)
+    bench.drive(lambda: any("over: " in line and said in line for line in log().splitlines()), "that it is over")
 
 
 def test_a_wheel_that_never_comes_is_named_while_the_others_drive(start_pair) -> None:

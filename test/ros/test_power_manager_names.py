@@ -56,6 +56,8 @@ def test_the_log_tells_the_way_from_start_to_end(start_pair) -> None:
     assert lines_with(running, ": active")
     bench.drive(lambda: lines_with(running, "first torque: "), "the first torque", soc=0.5)
     bench.drive(lambda: lines_with(running, "all inputs are there: normal operation"), "normal operation")
+    log = running.text()
+    assert log.index("normal operation") < log.index("first torque: ")
     refused = "bench asks for another quality of service"
     bench.drive(lambda: lines_with(running, refused), "the subscriber that cannot hear")
     bench.drive(

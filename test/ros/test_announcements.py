@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the log says, from plain numbers."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from iwm_power_manager.control.monitor import Tally
+from iwm_power_manager.control.supervision import MODE_DEGRADED, STALE_NAMES, STALE_SPEED, Supervision
+from iwm_power_manager.nodes.announcements import Announcements
+
+VALUES = {"missed_periods": 3, **{f"input_period_s.{name}": 0.01 for name in STALE_NAMES.values()}}
+
+
+class Log:
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def info(self, text: str) -> None:
+        self.lines.append(text)
+
+    warning = info
+
+
+@pytest.fixture
+def log() -> Log:
+    return Log()
+
+
+def prepared(elapsed_s: float, compiled: int) -> Any:
+    return SimpleNamespace(
+        values=VALUES,
+        vehicle=SimpleNamespace(name="car", hash="0" * 64),
+        policies=SimpleNamespace(description=lambda: "no policy", fallback_reason=""),
+        mapping=SimpleNamespace(commands={}),
+        elapsed_s=elapsed_s,
+        compiled=compiled,
+    )
+
+
+def test_an_input_that_is_back_already_is_named_with_its_age_and_its_limit(log: Log) -> None:
+    says = Announcements(log)
+    says.prepared(prepared(1.0, 0))
+    says.late(STALE_SPEED, (0.052, 0.01, 0.01, 0.1))
+    controller: Any = SimpleNamespace(
+        supervision=Supervision(mode=MODE_DEGRADED),
+        monitor=SimpleNamespace(tallies={name: Tally() for name in STALE_NAMES.values()}),
+        command=None,
+    )
+    says.stepped(controller, {}, {}, (), 0)
+    assert log.lines[-1] == (
+        "degraded, motor torque fades: vehicle_speed was 0.052 s old (input_period_s 0.01, missed_periods 3)"
+    )
+
+
+@pytest.mark.parametrize(("compiled", "words"), [(0, "no kernels compiled"), (7, "7 kernels compiled")])
+def test_a_slow_start_says_whether_it_compiled(log: Log, compiled: int, words: str) -> None:
+    says = Announcements(log)
+    says.preparing(4.0)
+    says.prepared(prepared(4.2, compiled))
+    assert log.lines[:2] == [
+        "preparing for 4 s so far; minutes only where precompile was not run",
+        f"prepared in 4.2 s, {words}",
+    ]
