@@ -53,14 +53,21 @@ def read_points(
     """
     table = read_table(path, separator, decimal)
     said = ["decimal commas"] if table.decimal == "," else []
-    if layout == "auto":
+    guessed = layout == "auto"
+    if guessed:
         layout = "list" if len(table.rows[-1][1]) == 3 else "matrix"
         said.append(f"layout {layout}: it has {len(table.rows[-1][1])} columns")
     header = " ".join(table.rows[0][1])
     if speed_unit == "auto":
         speed_unit = "rpm" if re.search(r"rpm|1/min|min-1|min\^-1|u/min", header, re.IGNORECASE) else "rad/s"
         said.append(f"speeds in {speed_unit}" + (", as the header says" if speed_unit == "rpm" else ": guessed"))
-    cells = _list(table) if layout == "list" else _matrix(table, down)
+    try:
+        cells = _list(table) if layout == "list" else _matrix(table, down)
+    except ConfigError as error:
+        if not guessed or layout == "list":
+            raise
+        problem = f"{error.problem} (taken for a matrix, as it has {len(table.rows[-1][1])} columns)"
+        raise ConfigError(path, error.key, problem, "for a list three columns: speed, torque, value") from None
     if percent is None and quantity == "efficiency":
         percent = any(value > 1.5 for _, _, _, value in cells)
         said += ["efficiencies in percent: one is above 1.5"] if percent else []

@@ -11,6 +11,7 @@ import dataclasses
 import math
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _solve(options: argparse.Namespace) -> int:
+    """Solve; a folder that was made for policies that did not come is taken away again."""
+    folder = Path(options.output or ".")
+    there = folder.exists()
+    try:
+        return _solve_into(options)
+    except BaseException:
+        if not there:
+            with suppress(OSError):  # it holds a policy already, or was never made
+                folder.rmdir()
+        raise
+
+
+def _solve_into(options: argparse.Namespace) -> int:
     _demand_arguments(options)
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
     problem = _problem(options, vehicle)

@@ -6,8 +6,10 @@ Charts and server are Bokeh's, whose scripts come from the same server: no netwo
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import itertools
+import re
 import sys
 import threading
 from collections import deque
@@ -20,6 +22,7 @@ from iwm_power_manager.control.supervision import MODE_NAMES, STALE_NAMES
 from iwm_power_manager.control.types import GATE_NAMES, LIMIT_NAMES, WHEEL_NAMES
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.signals.contract import DIAGNOSTICS, POWER_MANAGER_STATE
+from iwm_power_manager.tools.options import whole
 
 #: Steps that are kept for a page that has just been opened, and points a chart shows.
 KEPT = 3000
@@ -234,13 +237,23 @@ def print_reports(feed: Feed) -> None:
         print(report(feed), flush=True)
 
 
+def _full_name(text: str) -> list[str]:
+    """Argument type of a node's full name: the ROS arguments with which its topics are heard."""
+    if not re.fullmatch(r"(/[A-Za-z_]\w*)+", text, re.ASCII):
+        raise argparse.ArgumentTypeError(f"{text} is no full name of a node; allowed: such as /car_1/power_manager")
+    namespace, _, name = text.rpartition("/")
+    return ["--ros-args", "-r", f"__ns:={namespace or '/'}", "-r", f"{POWER_MANAGER_STATE}:={name}/state", "--"]
+
+
 _EXAMPLES = """\
 examples:
   The car on this machine's domain, in the browser:
     watch_car
   Over ssh, without a browser:
     watch_car --terminal
-  A power manager in a namespace, or under another name; ROS arguments stand last:
+  A power manager in a namespace, or under another name:
+    watch_car --node /car_1/power_manager
+  ROS arguments stand last:
     watch_car --ros-args -r __ns:=/car_1 -r power_manager/state:=my_node/state
 
 exit codes: 0 ended with Ctrl-C, 1 could not serve, 2 bad arguments
@@ -254,7 +267,12 @@ def main(args: Sequence[str] | None = None) -> int:
         description="Show a running car in the browser, from the power manager's topics alone; Ctrl-C ends it.",
         epilog=_EXAMPLES,
     )
-    parser.add_argument("--port", type=int, default=8321, help="port on this machine (default 8321; 0: any)")
+    parser.add_argument(
+        "--node", type=_full_name, metavar="NAME", help="full name of the node, as /car_1/power_manager"
+    )
+    parser.add_argument(
+        "--port", type=whole(0, 65535), default=8321, help="port on this machine (default 8321; 0: any)"
+    )
     parser.add_argument("--terminal", action="store_true", help="no page: print state and diagnostics once a second")
     parser.add_argument("--no-browser", action="store_true", help="only serve, and print the address")
     given = list(sys.argv[1:] if args is None else args)
@@ -266,7 +284,7 @@ def main(args: Sequence[str] | None = None) -> int:
     from iwm_power_manager.ros import ending
 
     feed = Feed()
-    node, thread, executor = listen(feed, ["watch_car", *given[len(own) :]])
+    node, thread, executor = listen(feed, ["watch_car", *(options.node or []), *given[len(own) :]])
     code = 1
     try:
         if options.terminal:

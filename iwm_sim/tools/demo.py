@@ -56,7 +56,7 @@ examples:
   The drive as a moving picture:
     demo --output runs/nycc --animate nycc.gif
 
-exit codes: 0 driven, 1 failed or a file is unusable, 2 bad arguments, 130 interrupted
+exit codes: 0 driven, 1 failed, 2 bad arguments or files, 130 interrupted
 """
 
 
@@ -150,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except IwmError as error:
         print(f"demo: {error}", file=sys.stderr)
-        return 1
+        return 2
 
 
 def _terminated(_number: int, _frame: Any) -> NoReturn:

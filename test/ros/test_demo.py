@@ -182,7 +182,7 @@ def test_it_refuses_to_write_over_another_run(finished) -> None:
         timeout=120,
         check=False,
     )
-    assert run.returncode == 1
+    assert run.returncode == 2
     assert run.stderr.splitlines() == [
         f"demo: {finished.folder}: cannot be created: File exists; allowed: a folder that is not there yet"
     ]

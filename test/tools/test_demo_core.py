@@ -58,7 +58,7 @@ def test_without_arguments_it_drives_nycc_with_the_shipped_policy_in_lockstep():
 )
 def test_a_bad_file_gives_one_line_before_anything_starts(tmp_path, monkeypatch, capsys, arguments, expected):
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    assert demo.main([*arguments, "--output", str(tmp_path / "run")]) == 1
+    assert demo.main([*arguments, "--output", str(tmp_path / "run")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(expected)
     assert not (tmp_path / "run").exists()

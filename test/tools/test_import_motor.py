@@ -104,6 +104,11 @@ def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys)
         ("w,t,loss\n1,2,-3\n", ("--quantity", "loss"), "loss -3 W is out of range"),
         ("w,t,eta\n-1,2,0.3\n", (), "speed_rad_s -1 is out of range"),
         ("w,1,2\n1,0.5,0.5,0.5\n", ("--layout", "matrix"), "line 2: has 3 values; allowed: 2, as in line 1"),
+        (
+            "speed_mps,t,a,b\n1,2,3,4\n",
+            (),
+            "is no number (taken for a matrix, as it has 4 columns); allowed: for a list three columns: speed, torque",
+        ),
         ("w,t,eta\n1,2,nan\n2,3,nan\n", (), "has no point with speed and torque above zero"),
     ],
 )

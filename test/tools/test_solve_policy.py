@@ -306,6 +306,8 @@ def test_an_interrupt_ends_it_without_a_traceback(grid, tmp_path, monkeypatch, c
     assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "a.npz", "--quiet") == 130
     assert "interrupted" in capsys.readouterr().err
     assert not (tmp_path / "a.npz").exists()
+    assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "folder", "--quiet") == 130
+    assert not (tmp_path / "folder").exists()
 
 
 def test_as_a_process_it_teaches_and_exits_with_its_codes(tmp_path):

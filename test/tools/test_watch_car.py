@@ -27,6 +27,21 @@ def values(**given: float) -> dict[str, float]:
     return dict.fromkeys(SIGNAL_NAMES, 0.0) | given
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--port", "99999"], "99999 is out of range; allowed: 0 to 65535"),
+        (["--node", "car 1"], "car 1 is no full name of a node; allowed: such as /car_1/power_manager"),
+    ],
+)
+def test_an_argument_that_cannot_be_is_one_line(arguments: list[str], words: str, capsys: Any) -> None:
+    with pytest.raises(SystemExit) as ended:
+        watch_car.main(arguments)
+    error = capsys.readouterr().err
+    assert (ended.value.code, error.count("\n")) == (2, 1)
+    assert words in error
+
+
 def test_a_page_gets_each_drawn_step_once_and_in_order() -> None:
     feed = Feed()
     for i in range(10 * EVERY):
