@@ -38,6 +38,9 @@ PROGRESS_EVERY = 2000
 _PROBE_READINGS = 1000
 #: Below this share of the messages of the busiest topic, a replay says that it made few steps.
 _FEW_STEPS = 0.1
+#: How many topics are named that may be a command under another name, and what to do with one.
+_CANDIDATES = 5
+_RENAME = "if it is one of them: --mapping with a copy of that file that has the recorded name"
 _FIRST_DECIDED = SIGNAL_NAMES.index(DECIDED_NAMES[0])
 
 
@@ -53,6 +56,7 @@ class ReplayReport(NamedTuple):
     first_stamp_ns, last_stamp_ns : of the steps
     span_ns : driven: from each step to the next, jumps back left out
     gaps : times at which steps are missing in the record, so that the law's memory is unknown
+    late_start : the recording began in the middle of a run, so that nobody knows the law's memory
     restarts : pauses in the inputs after which the law started anew
     bad_messages : messages that could not be decoded
     dropped : inputs that were not believed, by topic and reason
@@ -70,6 +74,7 @@ class ReplayReport(NamedTuple):
     last_stamp_ns: int
     span_ns: int
     gaps: int
+    late_start: bool
     restarts: int
     bad_messages: int
     dropped: dict[str, dict[str, int]]
@@ -158,6 +163,7 @@ class Replay:
             *self._stamps,
             self._span_ns,
             self._recorded.gaps if self._recorded else 0,
+            self._recorded is not None and self._recorded.late_start,
             self._reconstructed.restarts if self._reconstructed else 0,
             self._bad_messages + (self._stream.bad_messages if self._stream else 0),
             self._reconstructed.dropped if self._reconstructed else {},
@@ -223,11 +229,16 @@ class Replay:
                 self._commands[name] = command
             else:
                 self._not_compared.append(f"{name}: carries no stamp, and the bag no state to tell its step")
-        held = {sink.topic for _, sink in command_topics(self._bag, mapping).values()}
+        commands = command_topics(self._bag, mapping)
+        held = {sink.topic for _, sink in commands.values()}
+        known = {*commands, self._state_topic, *(topic_named(name, self._bag.topics) for name in mapping.topics())}
         for kind, sinks in mapping.commands.items():
             absent = [sink.topic for sink in sinks if sink.topic not in held]
             if absent:
-                self._not_compared.append(f"{kind} on {', '.join(absent)} ({mapping.path}): not in the bag")
+                types = {sink.type for sink in sinks}
+                likely = [name for name, one in self._bag.topics.items() if one.type in types and name not in known]
+                hint = f"; of its type: {', '.join(sorted(likely)[:_CANDIDATES])}; {_RENAME}" if likely else ""
+                self._not_compared.append(f"{kind} on {', '.join(absent)} ({mapping.path}): not in the bag{hint}")
             elif not sinks:
                 self._not_compared.append(f"{kind}: goes nowhere ({mapping.path})")
 

@@ -72,11 +72,13 @@ class RecordedSteps:
     Attributes
     ----------
     gaps : times at which the law's memory is unknown, because steps before are not in the bag
+    late_start : the first recorded step is not the first of its run
     faults : steps whose command no motor may be given; they come without a command
     """
 
     def __init__(self, plan: Plan) -> None:
         self.gaps = 0
+        self.late_start = False
         self.faults: Counter[str] = Counter()
         self._plan = plan
         self._state = initial_state()
@@ -97,6 +99,7 @@ class RecordedSteps:
             self._state = initial_state()
         elif number != self._next:
             self.gaps += 1
+            self.late_start |= self._last is None
             self._state = self._state._replace(steps=number)
         self._next = number + 1
         plan = self._plan

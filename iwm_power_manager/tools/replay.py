@@ -33,6 +33,7 @@ from iwm_power_manager.tools.command import DONE, described, ended
 from iwm_power_manager.tools.options import number, whole
 
 DIFFERENT = 1
+CANNOT_TELL = 3
 
 _DESCRIPTION = """\
 Run the control law over a recorded drive, without DDS and without a clock: the same bag gives the same bytes every
@@ -50,7 +51,8 @@ examples:
   Drive the real node with it, at half speed:
     replay drive_01 --publish --rate 0.5
 
-exit codes: 0 done, 1 recomputed and recorded differ (--compare), 2 bad arguments or files, 130 interrupted
+exit codes: 0 done, 1 recomputed and recorded differ (--compare), 2 bad arguments or files, 3 they differ, but the
+recording begins in the middle of a run, 130 interrupted
 """
 
 
@@ -158,8 +160,13 @@ def _replay(bag: BagReader, options: argparse.Namespace) -> int:
         if result["other_policy"]:
             lines.append("  the policy is not the one that was recorded: its file or folder has another SHA-256")
         lines += _comparison_lines(report)
+    code = DONE
+    if options.compare and exceeds(report.comparison, options.tolerance):
+        code = CANNOT_TELL if report.late_start else DIFFERENT
+    if code == CANNOT_TELL:
+        lines.append("  cannot tell: the recording begins in the middle of a run; start the recorder first")
     _show(lines, result, options)
-    return DIFFERENT if options.compare and exceeds(report.comparison, options.tolerance) else DONE
+    return code
 
 
 def _what_if(bag: BagReader, options: argparse.Namespace) -> int:

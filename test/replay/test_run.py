@@ -27,7 +27,7 @@ from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import standard_types
 from iwm_power_manager.tools.command import BAD_INPUT, DONE
-from iwm_power_manager.tools.replay import DIFFERENT, main
+from iwm_power_manager.tools.replay import CANNOT_TELL, DIFFERENT, main
 
 COUNT = 150
 STRATEGY = "instantaneous_slip"
@@ -257,6 +257,35 @@ def test_missing_steps_are_reported_because_the_memory_of_the_law_is_then_unknow
     text = capsys.readouterr().out
     assert "1 time(s) steps before are not in the bag" in text
     assert "without counterpart: 3 recorded, 0 recomputed" in text
+
+
+def test_a_recording_that_begins_in_the_middle_of_a_run_is_no_verdict(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagReader(drive) as source, BagWriter(tmp_path / "late") as bag:
+        numbers = {name: bag.add_topic(topic) for name, topic in source.topics.items()}
+        for message in source.messages():
+            if message.sequence >= 40:
+                bag.write(numbers[message.topic], message.log_time_ns, message.data)
+    assert main([str(tmp_path / "late"), "--compare"]) == CANNOT_TELL
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last == "  cannot tell: the recording begins in the middle of a run; start the recorder first"
+
+
+def test_a_command_recorded_under_another_name_is_named(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    renamed = {"/wheel_torque_command": "/torques"}
+    with BagReader(drive) as source, BagWriter(tmp_path / "renamed") as bag:
+        numbers = {
+            name: bag.add_topic(topic._replace(name=renamed.get(name, name))) for name, topic in source.topics.items()
+        }
+        for message in source.messages():
+            bag.write(numbers[message.topic], message.log_time_ns, message.data)
+    main([str(tmp_path / "renamed"), "--compare"])
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "not compared: " in line)
+    assert "not compared: motor_torque on wheel_torque_command" in line
+    assert "not in the bag; of its type: /torques; if it is one of them: --mapping with a copy" in line
 
 
 def test_two_activations_in_one_bag_are_both_repeated_from_their_first_step(

@@ -104,9 +104,9 @@ def test_the_page_shows_a_running_car(tmp_path: Path) -> None:
     environment = {**os.environ, "ROS_LOG_DIR": str(tmp_path), "PYTHONUNBUFFERED": "1"}
     name = f"/watch_{os.getpid()}"
     car = subprocess.Popen([sys.executable, "-c", _CAR, name], env=environment)
-    command = [sys.executable, "-m", "iwm_power_manager.tools.watch_car", "--no-browser", "--port", "0", "--ros-args"]
+    command = [sys.executable, "-m", "iwm_power_manager.tools.watch_car", "--no-browser", "--port", "0"]
     page = subprocess.Popen(
-        [*command, "-r", f"__ns:={name}", "-r", f"/diagnostics:={name}/diagnostics"],
+        [*command, "--node", f"{name}/power_manager", "--ros-args", "-r", f"/diagnostics:={name}/diagnostics"],
         env=environment,
         stdout=subprocess.PIPE,
         text=True,
