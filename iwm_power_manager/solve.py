@@ -59,6 +59,8 @@ def targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequenc
             raise ConfigError(
                 "arguments", "--output", f"{output} is one file for {len(frictions)} policies", "a folder"
             )
+        if not output.parent.is_dir():  # said before, not after the work
+            raise ConfigError("arguments", "--output", f"{output}: cannot be written: no such folder")
         return [output]
     try:
         output.mkdir(parents=True, exist_ok=True)
