@@ -33,7 +33,7 @@ study: setup-run  ## All tables and figures of the paper, and what beats them (3
 unseen: setup-run  ## Our strategy on cycles and cars that were not there when it was made (shows how far)
 	@$(BIN)/evaluate --unseen runs/unseen $(ARGS)
 
-roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required (4 min)
+roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required (2 min)
 	@$(BIN)/python -m iwm_sim.tools.roads --unknown --page docs/roads.md $(ARGS)
 
 docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (2 min)

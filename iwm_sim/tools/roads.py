@@ -33,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument("scenario", nargs="*", help="files, or names of config/scenarios (default: all of them)")
     result.add_argument("--strategy", choices=list(drivable()), default=DEFAULT_STRATEGY, help="(default: %(default)s)")
-    result.add_argument("--unknown", action="store_true", help="also what it costs not to know the friction (3 min)")
+    result.add_argument("--unknown", action="store_true", help="what not knowing the friction costs, too (1 min)")
     result.add_argument("--policy", default="policies", metavar="DIR", help="with --unknown (default: %(default)s)")
     result.add_argument("--page", type=Path, metavar="MD", help="write the table as a page")
     result.add_argument("--json", type=Path, metavar="FILE", help="write the values as JSON")
