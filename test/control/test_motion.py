@@ -247,17 +247,31 @@ def test_a_car_held_at_its_speed_under_torque_is_believed(torque):
     assert speeds[-1] == 10.0
 
 
+@pytest.mark.parametrize("torque", [33.0, -33.0])
 @pytest.mark.parametrize("shown", [lambda v: v, lambda v: math.nan])
-def test_wheels_that_are_all_doubted_are_right_again_when_nothing_makes_them_slip(shown):
+def test_wheels_that_are_all_doubted_are_right_again_when_nothing_makes_them_slip(shown, torque):
     car = Car(10.0)
     car.step(0.0)
     car.state = car.state._replace(
         motion=car.state.motion._replace(speed_mps=14.0, wheel_doubt_s=(0.5,) * 4, doubt_s=0.5)
     )
     for _ in range(70):
-        motion = car.step(33.0, shown)
+        motion = car.step(torque, shown)
     assert motion.doubted in (0, DOUBT_SPEED)
     assert motion.speed_mps == pytest.approx(car.v, abs=0.2)
+
+
+def test_the_slope_that_was_learned_outlasts_a_gap():
+    car = Car(20.0, grade_mps2=1.9)
+    for _ in range(300):
+        car.step(150.0)
+    learned = car.state.motion.bias_mps2
+    assert learned < -1.0  # the pull of the sensor is the rest of it
+    car.v, car.rim = 12.0, [12.0 / RADIUS] * 4
+    for _ in range(15):
+        car.step(150.0)
+    assert car.motion.doubted == 0
+    assert car.state.motion.bias_mps2 == pytest.approx(learned, abs=0.3)
 
 
 def test_zeros_of_a_dead_control_unit_do_not_stop_the_car():
