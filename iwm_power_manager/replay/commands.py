@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
@@ -120,3 +120,21 @@ def command_topics(bag: BagReader, mapping: SignalMapping) -> dict[str, tuple[st
         for sink in sinks
         if (name := topic_named(sink.topic, bag.topics)) is not None
     }
+
+
+def commands_elsewhere(bag: BagReader, mapping: SignalMapping, reports: Collection[str]) -> dict[str, list[str]]:
+    """Topics that may be a command under another name, by its kind, where the bag lacks a topic of that command.
+
+    They carry the message type of the command, and are neither inputs nor `reports` of the node.
+    """
+    commands = command_topics(bag, mapping)
+    held = {sink.topic for _, sink in commands.values()}
+    known = {*commands, *reports, *(topic_named(name, bag.topics) for name in mapping.topics())}
+    found = {}
+    for kind, sinks in mapping.commands.items():
+        types = {sink.type for sink in sinks}
+        if any(sink.topic not in held for sink in sinks):
+            found[kind] = sorted(
+                name for name, topic in bag.topics.items() if topic.type in types and name not in known
+            )
+    return found

@@ -17,13 +17,14 @@ from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS
 from iwm_power_manager.errors import BagError, ConfigError
-from iwm_power_manager.replay.commands import RecordedCommand, command_topics, torques_nm
+from iwm_power_manager.replay.commands import RecordedCommand, command_topics, commands_elsewhere, torques_nm
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import SignalStream, check_signals
 from iwm_power_manager.replay.steps import ReconstructedSteps, RecordedSteps, ReplayedStep
 from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.commands import CommandWriter
+from iwm_power_manager.signals.contract import NODE_FRICTION
 from iwm_power_manager.signals.contract import POWER_MANAGER_STATE as STATE
 from iwm_power_manager.signals.mapping import JOINT_STATE, SignalMapping, topic_named
 from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
@@ -229,16 +230,14 @@ class Replay:
                 self._commands[name] = command
             else:
                 self._not_compared.append(f"{name}: carries no stamp, and the bag no state to tell its step")
-        commands = command_topics(self._bag, mapping)
-        held = {sink.topic for _, sink in commands.values()}
-        known = {*commands, self._state_topic, *(topic_named(name, self._bag.topics) for name in mapping.topics())}
+        held = {sink.topic for _, sink in command_topics(self._bag, mapping).values()}
+        elsewhere = commands_elsewhere(self._bag, mapping, report_topics(self._bag))
         for kind, sinks in mapping.commands.items():
-            absent = [sink.topic for sink in sinks if sink.topic not in held]
+            absent = ", ".join(sink.topic for sink in sinks if sink.topic not in held)
             if absent:
-                types = {sink.type for sink in sinks}
-                likely = [name for name, one in self._bag.topics.items() if one.type in types and name not in known]
-                hint = f"; of its type: {', '.join(sorted(likely)[:_CANDIDATES])}; {_RENAME}" if likely else ""
-                self._not_compared.append(f"{kind} on {', '.join(absent)} ({mapping.path}): not in the bag{hint}")
+                likely = ", ".join(elsewhere[kind][:_CANDIDATES])
+                hint = f"; of its type: {likely}; {_RENAME}" if likely else ""
+                self._not_compared.append(f"{kind} on {absent} ({mapping.path}): not in the bag{hint}")
             elif not sinks:
                 self._not_compared.append(f"{kind}: goes nowhere ({mapping.path})")
 
@@ -287,7 +286,7 @@ class ReplayOutput:
         mapping = plan.mapping
         recorded = {sink.topic: name for name, (_, sink) in command_topics(bag, mapping).items()}
         state = state_topic(bag)
-        computed = {*recorded.values(), state}
+        computed = {*recorded.values(), *report_topics(bag)}
         self._copied = {
             name: writer.add_topic(topic) for name, topic in sorted(bag.topics.items()) if name not in computed
         }
@@ -352,6 +351,16 @@ def state_topic(bag: BagReader) -> str | None:
     if len(states) > 1:
         raise BagError(f"{bag.path}: holds the states of several nodes: {', '.join(sorted(states))}")
     return states[0] if states else None
+
+
+def report_topics(bag: BagReader) -> list[str]:
+    """The bag's topics that the power manager alone publishes: its state, and the estimated friction beside it."""
+    state = state_topic(bag)
+    if state is None:
+        return []
+    estimate = state.removesuffix(_STATE_OF_ANY) + NODE_FRICTION.removeprefix("~")
+    topic = bag.topics.get(estimate)
+    return [state] if topic is None or topic.type != JOINT_STATE else [state, estimate]
 
 
 def _carries_steps(bag: BagReader, topic: str) -> bool:

@@ -25,10 +25,11 @@ from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.control.strategies import drivable, name_of
 from iwm_power_manager.errors import BagError, ConfigError, IwmError, one_line
 from iwm_power_manager.files import atomic_write, check_number
-from iwm_power_manager.replay.commands import command_topics
+from iwm_power_manager.replay.commands import command_topics, commands_elsewhere
 from iwm_power_manager.replay.plan import Choice, Plan, make_plan, recorded_mapping, unknown_mapping
-from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds, state_topic
+from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds, report_topics
 from iwm_power_manager.replay.what_if import Consumption, what_if
+from iwm_power_manager.signals.mapping import SignalMapping
 from iwm_power_manager.tools.command import DONE, described, ended
 from iwm_power_manager.tools.options import number, whole
 
@@ -199,14 +200,28 @@ def _consumption_line(row: Consumption, saving: float | None) -> str:
     )
 
 
+def _check_commands_are_known(
+    bag: BagReader, mapping: SignalMapping, reports: Sequence[str], options: argparse.Namespace
+) -> None:
+    """Refuse to send a drive of which nobody knows what were commands: they would go to the motors."""
+    text = "does not say which topics are the car's commands, which a replay must not send"
+    unknown = unknown_mapping(bag.custom_data)
+    if unknown and not options.mapping:
+        raise ConfigError(bag.path, "", text, f"with --mapping {unknown[:200]!r}, or by name with --topics")
+    likely = {name for names in commands_elsewhere(bag, mapping, reports).values() for name in names}
+    if likely and reports:
+        text += f": perhaps {', '.join(sorted(likely)[:5])}"
+        raise ConfigError(bag.path, "", text, "with --mapping and their recorded names, or by name with --topics")
+
+
 def _publish(options: argparse.Namespace) -> int:
     from iwm_power_manager.ros.player import PlayOptions, play
 
     with BagReader(options.bag) as bag:
-        unknown = unknown_mapping(bag.custom_data)
-        if unknown and not options.mapping and not options.topics:
-            text = "does not say which topics are the car's commands, which a replay must not send"
-            raise ConfigError(bag.path, "", text, f"with --mapping {unknown[:200]!r}, or by name with --topics")
+        mapping = recorded_mapping(options.mapping, bag.custom_data)
+        reports = report_topics(bag)
+        if not options.topics:
+            _check_commands_are_known(bag, mapping, reports, options)
         return play(
             bag,
             PlayOptions(
@@ -216,7 +231,7 @@ def _publish(options: argparse.Namespace) -> int:
                 options.end,
                 options.loop,
                 tuple(options.topics or ()),
-                {*command_topics(bag, recorded_mapping(options.mapping, bag.custom_data)), state_topic(bag) or ""},
+                {*command_topics(bag, mapping), *reports},
                 options.listeners,
             ),
         )

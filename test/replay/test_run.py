@@ -13,6 +13,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from bags_helpers import TWIST, ScriptedDrive, float64, topic, twist
+from iwm_power_manager.bags.metadata import Topic
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.record import SIGNAL_NAMES, YOUNGER_SIGNALS
@@ -22,7 +23,7 @@ from iwm_power_manager.files import content_sha256
 from iwm_power_manager.policy import load_policy, save_policy
 from iwm_power_manager.replay.compare import TopicComparer
 from iwm_power_manager.replay.plan import Choice, make_plan, recorded_parameters
-from iwm_power_manager.replay.run import STATE, Replay
+from iwm_power_manager.replay.run import STATE, Replay, report_topics
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import standard_types
@@ -275,17 +276,50 @@ def test_a_recording_that_begins_in_the_middle_of_a_run_is_no_verdict(
 def test_a_command_recorded_under_another_name_is_named(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    renamed = {"/wheel_torque_command": "/torques"}
-    with BagReader(drive) as source, BagWriter(tmp_path / "renamed") as bag:
-        numbers = {
-            name: bag.add_topic(topic._replace(name=renamed.get(name, name))) for name, topic in source.topics.items()
-        }
-        for message in source.messages():
-            bag.write(numbers[message.topic], message.log_time_ns, message.data)
+    copied(drive, tmp_path / "renamed", {"/wheel_torque_command": "/torques"})
     main([str(tmp_path / "renamed"), "--compare"])
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "not compared: " in line)
     assert "not compared: motor_torque on wheel_torque_command" in line
     assert "not in the bag; of its type: /torques; if it is one of them: --mapping with a copy" in line
+
+
+def copied(drive: Path, path: Path, names: dict[str, str], *more: Topic) -> None:
+    """The same bag with other names of topics, and a message of `more` topics, each of a state."""
+    with BagReader(drive) as source, BagWriter(path) as bag:
+        numbers = {
+            name: bag.add_topic(topic._replace(name=names.get(name, name))) for name, topic in source.topics.items()
+        }
+        others = [bag.add_topic(topic) for topic in more]
+        for message in source.messages():
+            bag.write(numbers[message.topic], message.log_time_ns, message.data)
+            if message.topic == "/power_manager/state" and others:
+                bag.write(others.pop(), message.log_time_ns, message.data)
+
+
+@pytest.mark.parametrize("topic", ["wheel_torque_command", "friction_brake_command"])
+def test_a_drive_with_commands_under_another_name_is_not_published(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], topic: str
+) -> None:
+    copied(drive, tmp_path / "renamed", {f"/{topic}": "/torques"})
+    assert main([str(tmp_path / "renamed"), "--publish"]) == 2
+    told = capsys.readouterr()
+    assert "which a replay must not send: perhaps /torques; allowed: with --mapping" in told.err
+    assert told.out == ""
+
+
+def test_what_the_node_reports_is_neither_played_nor_copied_nor_taken_for_a_command(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagReader(drive) as source:
+        state = source.topics["/power_manager/state"]
+    estimate = state._replace(name="/power_manager/road_friction")
+    copied(drive, tmp_path / "all", {"/wheel_torque_command": "/torques"}, estimate)
+    with BagReader(tmp_path / "all") as bag:
+        assert report_topics(bag) == ["/power_manager/state", "/power_manager/road_friction"]
+    assert main([str(tmp_path / "all"), "--output", str(tmp_path / "again"), "--compare"]) in (0, 1)
+    assert "of its type: /torques; if" in capsys.readouterr().out
+    with BagReader(tmp_path / "again") as again:
+        assert "/power_manager/road_friction" not in again.topics
 
 
 def test_two_activations_in_one_bag_are_both_repeated_from_their_first_step(
