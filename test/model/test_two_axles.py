@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n
@@ -75,6 +75,25 @@ def test_from_any_guess_the_motion_is_that_of_the_general_step(speed, slips, mot
     grade=st.sampled_from([-0.15, 0.0, 0.05]),
     friction=st.tuples(st.sampled_from([0.3, 0.9]), st.sampled_from([0.4, 0.8])),
     car=st.sampled_from([CAR, FIALA]),
+)
+# Newton's method finds a second solution there, beyond the peak: the motion does not lead to it.
+@example(
+    speed=4.0488472636530775,
+    slips=(-0.31445026, 0.34593554),
+    motors=(150.22881101, 175.93788586),
+    brakes=(574.14343845, 0.0),
+    grade=0.0,
+    friction=(0.9, 0.4),
+    car=FIALA,
+)
+@example(
+    speed=5.430403937143089,
+    slips=(-0.45056646, 0.04815725),
+    motors=(-49.10025385, 80.06417915),
+    brakes=(38.21450567, 0.0),
+    grade=0.0,
+    friction=(0.9, 0.8),
+    car=FIALA,
 )
 def test_onward_the_motion_is_that_of_the_general_step_or_the_one_without_a_jump_to_sliding(
     speed, slips, motors, brakes, grade, friction, car
