@@ -17,14 +17,19 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 
 from iwm_power_manager.ros import ending, messages, qos
 
 PATIENCE_S = 60.0
+
+#: A service may answer before it has found who asked: the middleware drops that answer. Then it is asked again.
+AGAIN_S = 5.0
 TRANSITIONS = {
     "configure": Transition.TRANSITION_CONFIGURE,
     "activate": Transition.TRANSITION_ACTIVATE,
@@ -33,6 +38,16 @@ TRANSITIONS = {
     "shutdown_active": Transition.TRANSITION_ACTIVE_SHUTDOWN,
     "shutdown_inactive": Transition.TRANSITION_INACTIVE_SHUTDOWN,
     "shutdown_unconfigured": Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
+}
+
+
+#: Lifecycle state that a transition ends in.
+REACHED = {
+    "configure": "inactive",
+    "activate": "active",
+    "deactivate": "inactive",
+    "cleanup": "unconfigured",
+    **dict.fromkeys((name for name in TRANSITIONS if name.startswith("shutdown")), "finalized"),
 }
 
 
@@ -45,6 +60,21 @@ def environment(domain: int, log_dir: Path) -> dict[str, str]:
         "ROS_LOG_DIR": str(log_dir),
         "PYTHONUNBUFFERED": "1",
     }
+
+
+def answering(client: Client, request: Any) -> Callable[[], Future | None]:
+    """Condition to spin for: the future of an answered request, which is made again each `AGAIN_S`."""
+    asked: list[Future] = []
+    due_s = 0.0
+
+    def answered() -> Future | None:
+        nonlocal due_s
+        if time.monotonic() >= due_s:
+            due_s = time.monotonic() + AGAIN_S
+            asked.append(client.call_async(request))
+        return next((future for future in asked if future.done()), None)
+
+    return answered
 
 
 def arguments(parameters: Mapping[str, Any], remaps: Mapping[str, str] | None = None) -> list[str]:
@@ -169,20 +199,34 @@ class Bench:
 
     # Services
 
-    def call(self, kind: Any, service: str, request: Any) -> Any:
-        """Call a service of the power manager."""
+    def _client(self, kind: Any, service: str) -> Client:
+        """Client of a service of the power manager, once the service is there."""
         client = self.clients.get(service)
         if client is None:
             client = self.clients[service] = self.node.create_client(kind, f"power_manager/{service}")
         self.spin_until(client.service_is_ready, f"service {service}")
-        future = client.call_async(request)
-        self.spin_until(future.done, f"an answer of {service}")
-        return future.result()
+        return client
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """Call a service of the power manager that may be called twice."""
+        client = self._client(kind, service)
+        return self.spin_until(answering(client, request), f"an answer of {service}").result()
 
     def change_state(self, transition: str) -> bool:
-        """Ask for a lifecycle transition."""
-        request = ChangeState.Request(transition=Transition(id=TRANSITIONS[transition]))
-        return bool(self.call(ChangeState, "change_state", request).success)
+        """Ask for a lifecycle transition, once, since a second one would be refused; its answer may be lost."""
+        client = self._client(ChangeState, "change_state")
+        future = client.call_async(ChangeState.Request(transition=Transition(id=TRANSITIONS[transition])))
+        ask_s = time.monotonic() + AGAIN_S
+
+        def changed() -> bool:
+            nonlocal ask_s
+            if future.done() or time.monotonic() < ask_s:
+                return future.done()
+            ask_s = time.monotonic() + AGAIN_S
+            return self.lifecycle_state() == REACHED[transition]
+
+        self.spin_until(changed, f"an answer of {transition}")
+        return not future.done() or bool(future.result().success)
 
     def lifecycle_state(self) -> str:
         """Label of the lifecycle state."""

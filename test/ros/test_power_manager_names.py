@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import rclpy
-from bench import Bench, Running, arguments
+from bench import Bench, Running, answering, arguments
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -185,11 +185,12 @@ def test_services_are_answered_while_it_prepares(node: Any, monkeypatch: pytest.
     state = client_node.create_client(GetState, "power_manager/get_state")
     read = client_node.create_client(GetParameters, "power_manager/get_parameters")
 
-    def spin_until(condition: Any) -> None:
+    def spin_until(condition: Any) -> Any:
         end = time.monotonic() + 60.0
-        while not condition():
+        while not (found := condition()):
             assert time.monotonic() < end
             executor.spin_once(timeout_sec=0.05)
+        return found
 
     spin_until(lambda: all(client.service_is_ready() for client in (change, state, read)))
     request = ChangeState.Request()
@@ -197,11 +198,9 @@ def test_services_are_answered_while_it_prepares(node: Any, monkeypatch: pytest.
     configured = change.call_async(request)
     spin_until(begun.is_set)
     for client, asked in ((state, GetState.Request()), (read, GetParameters.Request(names=["friction"]))):
-        answer = client.call_async(asked)
-        spin_until(answer.done)
+        spin_until(answering(client, asked))
     assert not configured.done()
-    answer = state.call_async(GetState.Request())
-    spin_until(answer.done)
+    answer = spin_until(answering(state, GetState.Request()))
     assert answer.result().current_state.id == State.PRIMARY_STATE_UNCONFIGURED
     release.set()
     spin_until(configured.done)
