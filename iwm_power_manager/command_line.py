@@ -6,6 +6,8 @@ from __future__ import annotations
 import argparse
 from typing import Any, NoReturn
 
+from iwm_power_manager.exit_codes import BAD_INPUT
+
 
 class CommandParser(argparse.ArgumentParser):
     """A parser whose description and examples stand as typed, and which does not repeat its usage at an error."""
@@ -15,5 +17,5 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(prog, **settings)
 
     def error(self, message: str) -> NoReturn:
-        """Say what is wrong and where help is; exit code 2."""
-        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+        """Say what is wrong and where help is."""
+        self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from iwm_power_manager.exit_codes import BAD_INPUT, FAILED
+
 #: No message gets longer: a hostile file must not fill a terminal or a log.
 MAX_MESSAGE = 1000
 _MAX_PROBLEM = 300
@@ -19,10 +21,23 @@ def one_line(text: str, limit: int = MAX_MESSAGE) -> str:
 
 
 class IwmError(Exception):
-    """Base of every error that is reported to the user as one line, without a traceback."""
+    """Base of every error that is reported to the user as one line, without a traceback.
+
+    Attributes
+    ----------
+    exit_code : of a command that it ends: what was given is refused, unless a kind of error says otherwise
+    """
+
+    exit_code = BAD_INPUT
 
     def __init__(self, message: str) -> None:
         super().__init__(one_line(message))
+
+
+class FailedError(IwmError):
+    """What was given is right, and yet it could not be done."""
+
+    exit_code = FAILED
 
 
 class ConfigError(IwmError):

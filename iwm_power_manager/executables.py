@@ -14,10 +14,8 @@ import signal
 import sys
 from functools import partial
 
-#: Ctrl-C is how a node is ended: `ros2 launch` reports every other code as a crash.
-NODE_ENDED = 0
-#: What a shell makes of a command that Ctrl-C has ended.
-INTERRUPTED = 130
+from iwm_power_manager.exit_codes import DONE, INTERRUPTED
+
 #: Options that are answered without what the work needs.
 ASK_ONLY = frozenset({"-h", "--help", "--version"})
 
@@ -58,8 +56,8 @@ def run(module: str, interrupted: int) -> int:
 
 import_cycle = partial(run, "iwm_power_manager.tools.import_cycle", INTERRUPTED)
 import_motor = partial(run, "iwm_power_manager.tools.import_motor", INTERRUPTED)
-power_manager = partial(run, "iwm_power_manager.nodes.power_manager", NODE_ENDED)
-recorder = partial(run, "iwm_power_manager.nodes.recorder", NODE_ENDED)
+power_manager = partial(run, "iwm_power_manager.nodes.power_manager", DONE)
+recorder = partial(run, "iwm_power_manager.nodes.recorder", DONE)
 replay = partial(run, "iwm_power_manager.tools.replay", INTERRUPTED)
 set_parameter = partial(run, "iwm_power_manager.tools.set_parameter", INTERRUPTED)
 solve_policy = partial(run, "iwm_power_manager.tools.solve_policy", INTERRUPTED)

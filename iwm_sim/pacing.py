@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 from iwm_power_manager.control.types import Wheels
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.errors import FailedError
 
 #: The two commands that answer a set of inputs.
 MOTOR, FRICTION = range(2)
 
 
-class NoAnswerError(IwmError):
+class NoAnswerError(FailedError):
     """The power manager has not answered a set of inputs, however often it was sent."""
 
 

@@ -11,14 +11,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.errors import FailedError
 
 _LAST_LINES = 12
 #: How long a child that is asked to end (SIGTERM) may take before it is killed.
 ASK_S = 5.0
 
 
-class ChildError(IwmError):
+class ChildError(FailedError):
     """A child process has failed; `last_lines` is how its output ended."""
 
     def __init__(self, problem: str, last_lines: Sequence[str]) -> None:

@@ -35,6 +35,7 @@ from std_msgs.msg import Bool
 from iwm_power_manager.control.types import Wheels
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import ConfigError, IwmError
+from iwm_power_manager.exit_codes import DONE, FAILED
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.ros import ending, qos
 from iwm_power_manager.ros import messages as m
@@ -443,11 +444,11 @@ _EXAMPLES = """\
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Drive the cycle; returns the exit code: 0 at its end or on Ctrl-C, 1 with one line on an error."""
+    """Drive the cycle; returns the exit code; one line on an error."""
     interruption = Interruption()
     interruption.install()
     node: Simulator | None = None
-    code = 1
+    code = FAILED
     try:
         check_parameter_files(sys.argv if args is None else list(args))
         check_arguments(
@@ -470,10 +471,11 @@ def main(args: Sequence[str] | None = None) -> int:
         if node.done.done():
             node.done.result()
         executor.shutdown()
-        code = 0
+        code = DONE
     except KeyboardInterrupt:
-        code = 0
+        code = DONE
     except (IwmError, RuntimeError) as error:  # RuntimeError: rcl's only word for a wrong --ros-args
+        code = getattr(error, "exit_code", FAILED)
         print(f"simulator: {' '.join(str(error).split())}", file=sys.stderr)
     finally:
         with ending.bounded(code):

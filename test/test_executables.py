@@ -108,7 +108,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1])
 sys.modules["some_module"] = types.SimpleNamespace(main=lambda: 0)
 atexit.register(linger)
-sys.exit(executables.run("some_module", executables.NODE_ENDED))
+sys.exit(executables.run("some_module", 0))
 """
 
 

@@ -8,6 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from iwm_power_manager.errors import IwmError
+from iwm_power_manager.exit_codes import BAD_INPUT, DONE, FAILED
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.interruption import Interruption
@@ -30,7 +31,7 @@ _EXAMPLES = """\
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM; exit code 1 and one line if it cannot start."""
+    """Run the node until SIGINT or SIGTERM; one line if it cannot start."""
     # rclpy's own handlers would shut the context down before zero torque could be commanded.
     interruption = Interruption()
     interruption.install()
@@ -45,10 +46,10 @@ def main(args: list[str] | None = None) -> int:
         )
         return _run(interruption, args)
     except KeyboardInterrupt:
-        return 0  # ended before it had begun
+        return DONE  # ended before it had begun
     except IwmError as error:
-        print(f"power_manager: {str(error).splitlines()[0]}", file=sys.stderr)
-        return 1
+        print(f"power_manager: {error}", file=sys.stderr)
+        return error.exit_code
 
 
 def _run(interruption: Interruption, args: list[str] | None) -> int:
@@ -60,7 +61,7 @@ def _run(interruption: Interruption, args: list[str] | None) -> int:
     from iwm_power_manager.ros import ending
 
     node: PowerManager | None = None
-    code = 1
+    code = FAILED
     try:
         leave_shared_memory(os.environ)
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
@@ -70,10 +71,11 @@ def _run(interruption: Interruption, args: list[str] | None) -> int:
         if node.get_parameter("autostart").value:
             node.start_when_prepared()
         spin(node, interruption)
-        code = 1 if node.start_failed and not interruption.requested else 0
+        code = BAD_INPUT if node.start_failed and not interruption.requested else DONE
     except KeyboardInterrupt:
-        code = 0  # ended before it had begun
+        code = DONE  # ended before it had begun
     except (IwmError, RuntimeError) as error:
+        code = getattr(error, "exit_code", FAILED)
         print(f"power_manager: {str(error).splitlines()[0]}", file=sys.stderr)
     finally:
         compiling = node is not None and node.preparing

@@ -37,6 +37,8 @@ from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.bags.writer import Sample, WriterOptions
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import BagError, IwmError, one_line
+from iwm_power_manager.exit_codes import DONE
+from iwm_power_manager.exit_codes import FAILED as EXIT_FAILED
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.ros import ending
 from iwm_power_manager.ros.arguments import EXIT_CODES, check_parameter_files, parameters_help
@@ -370,7 +372,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return _run_node(arguments)
     except IwmError as error:
         print(f"recorder: {error}", file=sys.stderr)
-        return 1
+        return error.exit_code
 
 
 _EXAMPLES = f"""\
@@ -406,13 +408,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _recover(bags: Sequence[str]) -> int:
-    code = 0
+    code = DONE
     for bag in bags:
         try:
             print("\n".join(map(one_line, recover(bag).lines())))
         except IwmError as error:
             print(f"recorder: {error}", file=sys.stderr)
-            code = 1
+            code = error.exit_code
     return code
 
 
@@ -427,13 +429,14 @@ def _run_node(arguments: list[str]) -> int:
     except RuntimeError as error:  # rcl's only word for a wrong --ros-args
         raise ParameterError(" ".join(str(error).split())) from None
     node: Recorder | None = None
-    code = 1
+    code = EXIT_FAILED
     try:
         node = Recorder()
         check_parameter_files(arguments, node.get_fully_qualified_name())
         _record(node, interruption)
-        code = 0
+        code = DONE
     except IwmError as error:  # not left to the caller: as long as it is on its way, it keeps the node
+        code = EXIT_FAILED if node is not None and isinstance(error, BagError) else error.exit_code
         print(f"recorder: {error}", file=sys.stderr)
     finally:
         with ending.bounded(code):

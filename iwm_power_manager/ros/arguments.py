@@ -14,7 +14,7 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import read_yaml
 from iwm_power_manager.ros.specs import ParameterError, Spec
 
-EXIT_CODES = "exit codes: 0 ended as asked, 1 could not start or failed, 2 bad arguments"
+EXIT_CODES = "exit codes: 0 ended as asked, 1 failed, 2 bad arguments, parameters or files"
 
 _PARAMS_FILE = "--params-file"
 

@@ -4,16 +4,13 @@
 from __future__ import annotations
 
 import json
-import time
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
-from rclpy.task import Future
 
-#: An answer may be lost where its sender has not found who asked; then it is asked again.
-_AGAIN_S = 5.0
+from iwm_power_manager.ros.asking import Question
 
 
 class RemoteParameters:
@@ -57,27 +54,21 @@ class _Question:
         self._node = node
         self._lister = node.create_client(ListParameters, f"{name}/list_parameters")
         self._getter = node.create_client(GetParameters, f"{name}/get_parameters")
+        self._listing = Question(self._lister, ListParameters.Request())
         self._names: list[str] = []
-        self._listing: Future | None = None
-        self._getting: Future | None = None
-        self._asked_s = time.monotonic()
+        self._getting: Question | None = None
 
     def advance(self) -> str | None:
         """Do the next step that is due; the answer once it is there."""
-        if time.monotonic() - self._asked_s > _AGAIN_S:
-            self._asked_s = time.monotonic()
-            self._listing = self._getting = None
-        if self._listing is None:
-            if self._lister.service_is_ready() and self._getter.service_is_ready():
-                self._listing = self._lister.call_async(ListParameters.Request())
-        elif self._getting is None:
-            if self._listing.done():
-                self._names = sorted(self._listing.result().result.names)
-                self._getting = self._getter.call_async(GetParameters.Request(names=self._names))
-        elif self._getting.done():
-            values = [_plain(parameter_value_to_python(value)) for value in self._getting.result().values]
-            return json.dumps(dict(zip(self._names, values, strict=False)))
-        return None
+        if self._getting is None:
+            if (listed := self._listing.answer()) is None:
+                return None
+            self._names = sorted(listed.result.names)
+            self._getting = Question(self._getter, GetParameters.Request(names=self._names))
+        if (got := self._getting.answer()) is None:
+            return None
+        values = [_plain(parameter_value_to_python(value)) for value in got.values]
+        return json.dumps(dict(zip(self._names, values, strict=False)))
 
     def destroy(self) -> None:
         self._node.destroy_client(self._lister)

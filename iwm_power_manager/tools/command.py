@@ -14,9 +14,8 @@ from typing import Any
 from iwm_power_manager import __version__
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import IwmError
+from iwm_power_manager.exit_codes import DONE, INTERRUPTED
 from iwm_power_manager.files import atomic_write
-
-DONE, BAD_INPUT, INTERRUPTED = 0, 2, 130
 
 
 def described(name: str, description: str, examples: str, *, abbreviated: bool = True) -> argparse.ArgumentParser:
@@ -32,7 +31,7 @@ def ended(name: str, work: Callable[[], int | None]) -> int:
         return work() or DONE
     except IwmError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return error.exit_code
     except KeyboardInterrupt:
         print(f"{name}: interrupted; nothing half-written is left", file=sys.stderr)
         return INTERRUPTED

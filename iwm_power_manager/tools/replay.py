@@ -24,17 +24,15 @@ from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.control.strategies import drivable, name_of
 from iwm_power_manager.errors import BagError, ConfigError, IwmError, one_line
+from iwm_power_manager.exit_codes import CANNOT_TELL, DONE, FAILED
 from iwm_power_manager.files import atomic_write, check_number
 from iwm_power_manager.replay.commands import command_topics, commands_elsewhere
 from iwm_power_manager.replay.plan import Choice, Plan, make_plan, recorded_mapping, unknown_mapping
 from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds, report_topics
 from iwm_power_manager.replay.what_if import Consumption, what_if
 from iwm_power_manager.signals.mapping import SignalMapping
-from iwm_power_manager.tools.command import DONE, described, ended
+from iwm_power_manager.tools.command import described, ended
 from iwm_power_manager.tools.options import number, whole
-
-DIFFERENT = 1
-CANNOT_TELL = 3
 
 _DESCRIPTION = """\
 Run the control law over a recorded drive, without DDS and without a clock: the same bag gives the same bytes every
@@ -163,7 +161,7 @@ def _replay(bag: BagReader, options: argparse.Namespace) -> int:
         lines += _comparison_lines(report)
     code = DONE
     if options.compare and exceeds(report.comparison, options.tolerance):
-        code = CANNOT_TELL if report.late_start else DIFFERENT
+        code = CANNOT_TELL if report.late_start else FAILED
     if code == CANNOT_TELL:
         lines.append("  cannot tell: the recording begins in the middle of a run; start the recorder first")
     _show(lines, result, options)

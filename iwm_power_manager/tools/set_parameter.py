@@ -6,65 +6,87 @@ from __future__ import annotations
 import difflib
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from iwm_power_manager.command_line import CommandParser
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.errors import FailedError, IwmError
+from iwm_power_manager.exit_codes import DONE, FAILED
+from iwm_power_manager.ros.asking import AGAIN_S, Question
+from iwm_power_manager.ros.specs import ParameterError
+from iwm_power_manager.tools.options import number
 
-_TRANSITIONS = ("configure", "activate", "deactivate", "cleanup", "shutdown")
+#: Lifecycle transitions, and the state that each ends in.
+_TRANSITIONS = {
+    "configure": "inactive",
+    "activate": "active",
+    "deactivate": "inactive",
+    "cleanup": "unconfigured",
+    "shutdown": "finalized",
+}
+_LOOK_S = 0.05
 
 
 class _Remote:
     """A node that is asked for parameters and transitions; every answer is waited for, within limits."""
 
     def __init__(self, node: Any, name: str, patience_s: float) -> None:
-        from lifecycle_msgs.srv import ChangeState
-        from rclpy.parameter_client import AsyncParameterClient
-
         self._node = node
         self._name = name
         self._patience_s = patience_s
-        self._parameters = AsyncParameterClient(node, name)
-        self._lifecycle = node.create_client(ChangeState, f"{name}/change_state")
+        self._again_s = min(AGAIN_S, patience_s / 8.0)
+        self._clients: dict[str, Any] = {}
 
-    def _answer(self, future: Any) -> Any:
+    def _client(self, kind: Any, service: str) -> Any:
+        """Client of one of its services, once that is there."""
+        if service not in self._clients:
+            self._clients[service] = self._node.create_client(kind, f"{self._name}/{service}")
+        if not self._clients[service].wait_for_service(self._patience_s):
+            what = "no such node" if "parameters" in service else "no such node with a lifecycle"
+            raise FailedError(f"{self._name}: {what} on this domain within {self._patience_s:g} s")
+        return self._clients[service]
+
+    def _until(self, look: Callable[[], Any]) -> Any:
+        """Serve callbacks until `look` finds something."""
         import rclpy
 
-        rclpy.spin_until_future_complete(self._node, future, timeout_sec=self._patience_s)
-        if not future.done():
-            raise IwmError(f"{self._name}: does not answer within {self._patience_s:g} s")
-        return future.result()
+        due_s = time.monotonic() + self._patience_s
+        while (found := look()) is None:
+            if time.monotonic() > due_s:
+                raise FailedError(f"{self._name}: does not answer within {self._patience_s:g} s")
+            rclpy.spin_once(self._node, timeout_sec=_LOOK_S)
+        return found
 
-    def find(self) -> None:
-        """Wait until it is there."""
-        if not self._parameters.wait_for_services(self._patience_s):
-            raise IwmError(f"{self._name}: no such node on this domain within {self._patience_s:g} s")
+    def _ask(self, kind: Any, service: str, **request: Any) -> Any:
+        """Answer to a request that may be made twice."""
+        return self._until(Question(self._client(kind, service), kind.Request(**request), self._again_s).answer)
 
     def values(self, names: Sequence[str]) -> dict[str, Any]:
         """Values of parameters; of all for no name."""
+        from rcl_interfaces.srv import GetParameters, ListParameters
         from rclpy.parameter import parameter_value_to_python
 
-        known = sorted(self._answer(self._parameters.list_parameters()).result.names)
+        known = sorted(self._ask(ListParameters, "list_parameters").result.names)
         for name in names:
             if name not in known:
                 near = difflib.get_close_matches(name, known)
                 hint = f"; did you mean {' or '.join(near)}?" if near else ""
-                raise IwmError(f"{self._name}: {name}: no such parameter{hint}")
+                raise FailedError(f"{self._name}: {name}: no such parameter{hint}")
         wanted = list(names) or known
-        values = self._answer(self._parameters.get_parameters(wanted)).values
+        values = self._ask(GetParameters, "get_parameters", names=wanted).values
         return {name: parameter_value_to_python(value) for name, value in zip(wanted, values, strict=True)}
 
     def set(self, assignments: Sequence[str]) -> None:
         """Set parameters, each NAME=VALUE in YAML; print what they were and are, or `IwmError` with the reason."""
         from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+        from rcl_interfaces.srv import SetParameters
         from rclpy.parameter import get_parameter_value
 
         given = {}
         for assignment in assignments:
             name, equals, text = assignment.partition("=")
             if not (name and equals):
-                raise IwmError(f"{assignment!r} is not allowed; allowed: NAME=VALUE")
+                raise ParameterError(f"{assignment!r} is not allowed; allowed: NAME=VALUE")
             given[name] = text
         now = self.values(list(given))
         parameters = []
@@ -73,24 +95,39 @@ class _Remote:
             if isinstance(now[name], float) and value.type == ParameterType.PARAMETER_INTEGER:
                 value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=float(value.integer_value))
             parameters.append(Parameter(name=name, value=value))
-        for parameter, result in zip(
-            parameters, self._answer(self._parameters.set_parameters(parameters)).results, strict=True
-        ):
+        results = self._ask(SetParameters, "set_parameters", parameters=parameters).results
+        for parameter, result in zip(parameters, results, strict=True):
             if not result.successful:
-                raise IwmError(f"{self._name}: {parameter.name}: {result.reason or 'refused'}")
+                raise FailedError(f"{self._name}: {parameter.name}: {result.reason or 'refused'}")
         for name, value in self.values(list(given)).items():
             print(f"{name}: {now[name]} -> {value}")
 
     def change(self, transition: str) -> None:
-        """Ask for a lifecycle transition; `IwmError` if it is refused."""
-        from lifecycle_msgs.srv import ChangeState
+        """Ask for a lifecycle transition; `IwmError` if it is refused.
 
-        if not self._lifecycle.wait_for_service(self._patience_s):
-            raise IwmError(f"{self._name}: has no lifecycle")
-        request = ChangeState.Request()
-        request.transition.label = transition
-        if not self._answer(self._lifecycle.call_async(request)).success:
-            raise IwmError(f"{self._name}: {transition} was refused; its log says why")
+        It is asked for once: by then somebody else may have made another. Where the answer stays away, the state tells.
+        """
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState, GetState
+
+        request = ChangeState.Request(transition=Transition(label=transition))
+        asked = self._client(ChangeState, "change_state").call_async(request)
+        states = self._client(GetState, "get_state")
+        look_s = time.monotonic() + self._again_s
+        state: Question | None = None
+
+        def outcome() -> bool | None:
+            nonlocal look_s, state
+            if asked.done():
+                return bool(asked.result().success)
+            if time.monotonic() > look_s:
+                look_s = time.monotonic() + self._again_s
+                state = Question(states, GetState.Request(), self._again_s)
+            found = state and state.answer()
+            return True if found and found.current_state.label == _TRANSITIONS[transition] else None
+
+        if not self._until(outcome):
+            raise FailedError(f"{self._name}: {transition} was refused; its log says why")
 
 
 _EXAMPLES = """\
@@ -103,7 +140,7 @@ examples:
   A node in a namespace shall command nothing any more:
     set_parameter --node /car_1/power_manager --transition deactivate
 
-exit codes: 0 done, 1 no such node or parameter, or refused, 2 bad arguments
+exit codes: 0 done, 1 no such node or parameter, no answer, or refused by the node, 2 bad arguments
 """
 
 
@@ -118,7 +155,11 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument("--node", default="/power_manager", help="full name of the node (default /power_manager)")
     parser.add_argument("--transition", choices=_TRANSITIONS, help="ask for this transition afterwards")
     parser.add_argument(
-        "--patience", type=float, default=10.0, metavar="S", help="wait so long for each answer, s (default: 10)"
+        "--patience",
+        type=number(0.1, 3600.0),
+        default=10.0,
+        metavar="S",
+        help="wait so long for each answer, s (default: 10)",
     )
     options = parser.parse_args(args)
     import rclpy
@@ -129,10 +170,9 @@ def main(args: Sequence[str] | None = None) -> int:
     node = rclpy.create_node(
         f"set_parameter_{time.monotonic_ns()}", enable_rosout=False, start_parameter_services=False
     )
-    code = 1
+    code = FAILED
     try:
         remote = _Remote(node, options.node, options.patience)
-        remote.find()
         assignments = [text for text in options.parameters if "=" in text]
         names = [text for text in options.parameters if "=" not in text]
         if assignments:
@@ -142,8 +182,9 @@ def main(args: Sequence[str] | None = None) -> int:
                 print(f"{name}: {value}")
         if options.transition:
             remote.change(options.transition)
-        code = 0
+        code = DONE
     except IwmError as error:
+        code = error.exit_code
         print(f"set_parameter: {error}", file=sys.stderr)
     finally:
         with ending.bounded(code):

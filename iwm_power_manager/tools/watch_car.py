@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.supervision import MODE_NAMES, STALE_NAMES
 from iwm_power_manager.control.types import GATE_NAMES, LIMIT_NAMES, WHEEL_NAMES
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.errors import FailedError, IwmError
+from iwm_power_manager.exit_codes import DONE, FAILED
 from iwm_power_manager.signals.contract import DIAGNOSTICS, POWER_MANAGER_STATE
 from iwm_power_manager.tools.options import whole
 
@@ -203,7 +204,7 @@ def serve(feed: Feed, port: int, *, open_browser: bool) -> None:
     try:
         server = Server({"/": application}, address="127.0.0.1", port=port)
     except OSError as error:
-        raise IwmError(f"--port {port}: {error.strerror or error}") from None
+        raise FailedError(f"--port {port}: {error.strerror or error}") from None
     url = f"http://localhost:{server.port}/"
     loop = server.io_loop
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -280,19 +281,20 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(own)
     if not options.terminal and importlib.util.find_spec("bokeh") is None:
         print("watch_car: needs the package bokeh (python3-bokeh-pip, or pip install bokeh)", file=sys.stderr)
-        return 1
+        return FAILED
     from iwm_power_manager.ros import ending
 
     feed = Feed()
     node, thread, executor = listen(feed, ["watch_car", *(options.node or []), *given[len(own) :]])
-    code = 1
+    code = FAILED
     try:
         if options.terminal:
             print_reports(feed)
         else:
             serve(feed, options.port, open_browser=not options.no_browser)
-        code = 0
+        code = DONE
     except IwmError as error:
+        code = error.exit_code
         print(f"watch_car: {error}", file=sys.stderr)
     finally:
         with ending.bounded(code):

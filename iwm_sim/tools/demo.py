@@ -24,6 +24,7 @@ from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError, IwmError
+from iwm_power_manager.exit_codes import DONE, FAILED, INTERRUPTED
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.tools.options import number
 from iwm_sim import metrics
@@ -142,15 +143,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run(plan)
     except KeyboardInterrupt:
         print("\ndemo: stopped; all processes have ended", file=sys.stderr)
-        return 130
-    except ChildError as error:
-        print(f"demo: {error}; its last lines:", file=sys.stderr)
-        for line in error.last_lines:
-            print(f"    {line}", file=sys.stderr)
-        return 1
+        return INTERRUPTED
     except IwmError as error:
-        print(f"demo: {error}", file=sys.stderr)
-        return 2
+        last_lines = error.last_lines if isinstance(error, ChildError) else []
+        print(f"demo: {error}{'; its last lines:' if last_lines else ''}", file=sys.stderr)
+        for line in last_lines:
+            print(f"    {line}", file=sys.stderr)
+        return error.exit_code
 
 
 def _terminated(_number: int, _frame: Any) -> NoReturn:
@@ -161,7 +160,7 @@ def _terminated(_number: int, _frame: Any) -> NoReturn:
 
 
 def run(plan: Plan) -> int:
-    """Do all of it; returns the exit code: 1 if the bag lacks anything that was published."""
+    """Do all of it; returns the exit code: `FAILED` if the bag lacks anything that was published."""
     if plan.scenario:
         return run_scenario(plan)
     loaded = load(plan)
@@ -185,7 +184,7 @@ def run(plan: Plan) -> int:
 
 
 def run_scenario(plan: Plan) -> int:
-    """Drive a scenario over DDS and say what it requires; the exit code is 1 if that or the bag falls short."""
+    """Drive a scenario over DDS and say what it requires; the exit code is `FAILED` if that or the bag falls short."""
     scenario = load_scenario(plan.scenario, plan.idle_drive or None)
     plan = dataclasses.replace(plan, vehicle=str(scenario.vehicle.path), friction=scenario.told_friction)
     load(plan)
@@ -198,7 +197,7 @@ def run_scenario(plan: Plan) -> int:
         print(remark)
     if plan.json:
         files.atomic_write(plan.json, json.dumps(result.values, indent=1).encode() + b"\n")
-    return 0 if outcome.complete and result.passed else 1
+    return DONE if outcome.complete and result.passed else FAILED
 
 
 def _make_output(plan: Plan) -> None:
@@ -253,7 +252,7 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
             f"{loaded.cycle.name}, friction {plan.friction:g}, idle drive {loaded.vehicle.idle_drive}, {plan.strategy}",
         )
         print(f"moving picture: {plan.animate}")
-    return 0 if outcome.complete else 1
+    return DONE if outcome.complete else FAILED
 
 
 def made_with(plan: Plan, loaded: Loaded) -> str:

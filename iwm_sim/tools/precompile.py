@@ -112,7 +112,7 @@ def parser() -> argparse.ArgumentParser:
         description="Compile the vehicle model, the control law and the solver once, so that every program starts "
         "warm. The code is kept in ~/.cache/iwm_power_manager or, if it is set, in IWM_CACHE_DIR, which then has to "
         "be the same where the programs run. Needed again after an update; what is compiled already is only looked up.",
-        epilog="exit codes: 0 done, 1 a shipped file is unusable, 2 bad arguments",
+        epilog="exit codes: 0 done, 2 bad arguments, or a shipped file is unusable",
     )
     made.add_argument("--json", action="store_true", help="list every entry point with its seconds, as JSON")
     made.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -120,7 +120,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Compile everything; 0 when done, 1 if a shipped file it needs is unusable."""
+    """Compile everything; returns the exit code."""
     options = parser().parse_args(arguments)
     from tqdm import tqdm
 
@@ -134,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 job()
     except IwmError as error:
         print(f"precompile: error: {error}", file=sys.stderr)
-        return 1
+        return error.exit_code
     kernel_cache.prune(UNUSED_FOR_S)
     if options.json:
         print(json.dumps([use._asdict() for use in compilation.USES], indent=2))

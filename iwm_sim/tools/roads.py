@@ -15,6 +15,7 @@ from pathlib import Path
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
+from iwm_power_manager.exit_codes import DONE, FAILED
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.command import ended, write_json
@@ -22,8 +23,6 @@ from iwm_sim.road_report import page, text, unknown
 from iwm_sim.road_run import RoadResult, check_scenario
 from iwm_sim.scenario import DEFAULT_VEHICLE, FOLDER, load_scenario
 from iwm_sim.unknown_friction import all_cells, all_jumped, differs, savings
-
-DONE, FAILED = 0, 1
 
 
 def parser() -> argparse.ArgumentParser:

@@ -13,11 +13,11 @@ import zstandard
 import foreign_bags as foreign
 from foreign_bags import CHANNELS, COUNT, DEMAND, JOINTS, LINE, SPEED, drive, write_bag, write_mcap, write_sqlite
 from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.exit_codes import BAD_INPUT, DONE
 from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.recorded import read_signal
 from iwm_power_manager.replay.run import Replay
 from iwm_power_manager.signals.mapping import load_mapping
-from iwm_power_manager.tools.command import BAD_INPUT, DONE
 from iwm_power_manager.tools.replay import main
 
 FORKED = f"geometry_msgs/Twist twist\n{LINE}\nMSG: geometry_msgs/Twist\nfloat64 x\n"

@@ -19,6 +19,7 @@ from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.record import SIGNAL_NAMES, YOUNGER_SIGNALS
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.errors import ConfigError, PolicyError
+from iwm_power_manager.exit_codes import BAD_INPUT, CANNOT_TELL, DONE, FAILED
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.policy import load_policy, save_policy
 from iwm_power_manager.replay.compare import TopicComparer
@@ -27,8 +28,7 @@ from iwm_power_manager.replay.run import STATE, Replay, report_topics
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import standard_types
-from iwm_power_manager.tools.command import BAD_INPUT, DONE
-from iwm_power_manager.tools.replay import CANNOT_TELL, DIFFERENT, main
+from iwm_power_manager.tools.replay import main
 
 COUNT = 150
 STRATEGY = "instantaneous_slip"
@@ -75,7 +75,7 @@ def test_a_changed_gain_limit_or_strategy_is_caught(
     kind: str, change: list[str], request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = request.getfixturevalue(kind)
-    assert main([str(path), "--compare", *change]) == DIFFERENT
+    assert main([str(path), "--compare", *change]) == FAILED
     text = capsys.readouterr().out
     assert "/wheel_torque_command" in text
     assert "first at message" in text
@@ -93,7 +93,7 @@ def test_a_changed_limit_of_the_vehicle_is_caught(
     ]
     changed.write_text("\n".join(lines) + "\n")
     assert changed.read_text() != text
-    assert main([str(drive), "--compare", "--vehicle", str(changed)]) == DIFFERENT
+    assert main([str(drive), "--compare", "--vehicle", str(changed)]) == FAILED
     assert "friction_brake_command" in capsys.readouterr().out
 
 
@@ -121,10 +121,10 @@ def test_a_changed_policy_is_caught_and_the_same_one_matches(
     # Long enough for the policies of friction 0.9 and 0.5, which are much alike, to disagree.
     drive = ScriptedDrive("sdp", share_path("policies")).write(tmp_path / "drive", 2 * COUNT, state=state)
     for name, arguments in changed_policies(tmp_path).items():
-        wanted = DONE if name.startswith("the same") else DIFFERENT
+        wanted = DONE if name.startswith("the same") else FAILED
         assert main([str(drive), "--compare", *arguments]) == wanted, name
         text = capsys.readouterr().out
-        assert ("first at message" in text) == (wanted == DIFFERENT), name
+        assert ("first at message" in text) == (wanted == FAILED), name
 
 
 def test_a_bag_of_before_a_signal_was_added_is_replayed(drive: Path, tmp_path: Path) -> None:
@@ -199,7 +199,7 @@ def test_a_policy_changed_in_its_place_is_caught(tmp_path: Path, capsys: pytest.
     drive = ScriptedDrive("sdp", file).write(tmp_path / "drive", COUNT)
     assert main([str(drive), "--compare", "--policy", str(file)]) == DONE
     save_policy(dataclasses.replace(policy, front_share=1.0 - policy.front_share), file)
-    assert main([str(drive), "--compare", "--policy", str(file)]) == DIFFERENT
+    assert main([str(drive), "--compare", "--policy", str(file)]) == FAILED
     assert "first at message" in capsys.readouterr().out
 
 

@@ -14,6 +14,7 @@ import pytest
 from bench import Running, arguments
 from stack import JOINTS, NUMBER, NUMBERS, Stack, number, of_type
 
+from iwm_power_manager.exit_codes import BAD_INPUT
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.tools.replay import main as replay
@@ -322,7 +323,7 @@ def test_a_mapping_that_cannot_work_is_one_line_that_names_the_key(
     running = Running(
         MODULE, arguments({"strategy": "equal", "policy_file": "", "signals_file": path}), DOMAIN, tmp_path
     )
-    assert running.wait() == 1
+    assert running.wait() == BAD_INPUT
     (line,) = [line for line in running.text().splitlines() if line.startswith("[ERROR]")]
     assert f"{path}: " in line
     assert problem in line

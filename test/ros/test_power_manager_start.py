@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from bench import PATIENCE_S, Bench, Running, arguments
 
+from iwm_power_manager.exit_codes import BAD_INPUT
 from iwm_power_manager.files import read_yaml
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros import messages, qos
@@ -24,7 +25,7 @@ DOMAIN = int(os.environ["ROS_DOMAIN_ID"])
 
 def fails_with(folder: Path, args: list[str]) -> str:
     running = Running(MODULE, args, DOMAIN, folder)
-    assert running.wait() == 1
+    assert running.wait() == BAD_INPUT
     lines = [line for line in running.text().splitlines() if line.strip()]
     assert len(lines) == 1, running.text()
     return lines[0]

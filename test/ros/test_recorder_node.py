@@ -31,6 +31,7 @@ from std_srvs.srv import Trigger
 from disk_helpers import on_small_disk
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.recover import recover
+from iwm_power_manager.exit_codes import BAD_INPUT
 from iwm_power_manager.ros import ending
 
 PATIENCE_S = 60.0
@@ -411,7 +412,7 @@ def test_into_a_read_only_folder_nothing_is_recorded_and_one_line_says_so(
     process = recorder(tmp_path / "bag", disk="ro,size=64k")
     process.process.wait(PATIENCE_S)
     code, error = process.end()
-    assert (code, error) == (1, f"recorder: {tmp_path / 'bag'}: cannot be created: Read-only file system\n")
+    assert (code, error) == (BAD_INPUT, f"recorder: {tmp_path / 'bag'}: cannot be created: Read-only file system\n")
 
 
 @pytest.mark.parametrize(
@@ -426,13 +427,13 @@ def test_into_a_read_only_folder_nothing_is_recorded_and_one_line_says_so(
         ("output:={existing}", "exists already and is not overwritten"),
     ],
 )
-def test_a_wrong_parameter_gets_one_line_and_exit_code_1(
+def test_a_wrong_parameter_gets_one_line(
     tmp_path: Path, recorder: Callable[..., RecorderProcess], parameter: str, line: str
 ) -> None:
     process = recorder(tmp_path / "bag", parameter.replace("{existing}", str(tmp_path)))
     process.process.wait(PATIENCE_S)
     code, error = process.end()
-    assert code == 1
+    assert code == BAD_INPUT
     assert line in error
     assert len(error.strip().splitlines()) == 1
     assert error.startswith("recorder: ")
@@ -458,7 +459,7 @@ def test_the_recover_command_needs_no_ros_and_says_what_was_lost(tmp_path: Path)
     assert "rebuilt with 1 messages" in done.stdout
     assert "metadata.yaml written" in done.stdout
     done = subprocess.run([*command, str(tmp_path / "none")], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
+    assert done.returncode == BAD_INPUT
     assert done.stderr == f"recorder: {tmp_path / 'none'}: does not exist\n"
 
 

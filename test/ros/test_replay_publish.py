@@ -17,13 +17,13 @@ import pytest
 import foreign_bags as foreign
 from bags_helpers import ScriptedDrive
 from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.exit_codes import DONE, FAILED
 from iwm_power_manager.policy import load_policy, save_policy
 from iwm_power_manager.ros.player import paced
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.contract import FRICTION_BRAKE_COMMAND as FRICTION_COMMAND
 from iwm_power_manager.signals.contract import WHEEL_TORQUE_COMMAND as MOTOR_COMMAND
-from iwm_power_manager.tools.command import DONE
-from iwm_power_manager.tools.replay import DIFFERENT, main
+from iwm_power_manager.tools.replay import main
 
 PATIENCE_S = 90.0
 COUNT = 120
@@ -139,7 +139,7 @@ def test_the_lockstep_node_driven_by_a_bag_commands_what_the_offline_replay_does
         ["--policy", str(tmp_path / "nudged.npz")],
         ["--friction", "0.2"],
     ):
-        assert main([str(recorded), "--compare", *change]) == DIFFERENT, change
+        assert main([str(recorded), "--compare", *change]) == FAILED, change
 
 
 def test_a_recording_of_the_real_time_node_replays_exactly(
@@ -157,7 +157,7 @@ def test_a_recording_of_the_real_time_node_replays_exactly(
     other = car.replace("radius_m: 0.33", "radius_m: 0.30")
     assert other != car
     (tmp_path / "other.yaml").write_text(other)
-    assert main([str(recorded), "--compare", "--vehicle", str(tmp_path / "other.yaml")]) == DIFFERENT
+    assert main([str(recorded), "--compare", "--vehicle", str(tmp_path / "other.yaml")]) == FAILED
 
 
 def test_start_end_and_steps_choose_what_is_played(tmp_path: Path, start: Callable[..., subprocess.Popen[str]]) -> None:

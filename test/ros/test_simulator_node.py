@@ -18,6 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.exit_codes import BAD_INPUT, FAILED
 from iwm_power_manager.files import read_yaml
 from iwm_power_manager.ros import ending, qos
 from iwm_power_manager.ros import messages as m
@@ -301,9 +302,10 @@ def test_commands_that_stop_leave_motors_off_and_brakes_at_the_pedal(stand_in) -
         ({"partner_timeout_s": 0.2}, "after 0.2 s there is still no subscription of"),
     ],
 )
-def test_what_it_cannot_work_with_gives_one_line_and_exit_code_1(capfd, monkeypatch, parameters, expected) -> None:
+def test_what_it_cannot_work_with_gives_one_line(capfd, monkeypatch, parameters, expected) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    assert simulator.main(["simulator", *arguments(parameters, {"__ns": f"/alone_{os.getpid()}"})]) == 1
+    code = FAILED if "partner_timeout_s" in parameters else BAD_INPUT
+    assert simulator.main(["simulator", *arguments(parameters, {"__ns": f"/alone_{os.getpid()}"})]) == code
     output = capfd.readouterr()
     lines = [line for line in (output.out + output.err).splitlines() if not line.startswith("[INFO]")]
     assert len(lines) == 1, lines
@@ -313,25 +315,25 @@ def test_what_it_cannot_work_with_gives_one_line_and_exit_code_1(capfd, monkeypa
 def test_a_parameter_that_does_not_exist_is_refused(capfd, monkeypatch) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     given = arguments({"cycle": "udds"}, {"__ns": f"/alone_{os.getpid()}"})
-    assert simulator.main(["simulator", *given]) == 1
+    assert simulator.main(["simulator", *given]) == BAD_INPUT
     assert "parameter cycle is unknown; is cycle_file meant?" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("args", "code", "expected"),
+    ("args", "expected"),
     [
-        (["--ros-args", "--params-file", "/nowhere.yaml"], 1, "simulator: /nowhere.yaml: cannot be read"),
-        (["--ros-args", "-p", "friction=0.5"], 1, "simulator: Failed to parse ROS arguments: Couldn't parse parameter"),
-        (["--friction", "0.5"], 2, "simulator: error: unrecognized arguments: --friction 0.5"),
+        (["--ros-args", "--params-file", "/nowhere.yaml"], "simulator: /nowhere.yaml: cannot be read"),
+        (["--ros-args", "-p", "friction=0.5"], "simulator: Failed to parse ROS arguments: Couldn't parse parameter"),
+        (["--friction", "0.5"], "simulator: error: unrecognized arguments: --friction 0.5"),
     ],
 )
-def test_a_wrong_command_line_is_refused_in_one_line(capsys, monkeypatch, args, code, expected) -> None:
+def test_a_wrong_command_line_is_refused_in_one_line(capsys, monkeypatch, args, expected) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     try:
         found = simulator.main(["simulator", *args])
     except SystemExit as stop:
         found = stop.code
-    assert found == code
+    assert found == BAD_INPUT
     assert capsys.readouterr().err.splitlines()[-1].startswith(expected)
 
 

@@ -16,12 +16,13 @@ from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.exit_codes import BAD_INPUT, DONE
 from iwm_power_manager.mdp.demand import Source
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.recorded import RecordedDrive
 from iwm_power_manager.share import share_path
-from iwm_power_manager.tools import command, solve_policy
+from iwm_power_manager.tools import solve_policy
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import closed_loop, learning
 from iwm_sim.learning import CYCLES_ALONE, RECORDING_ALONE, Candidate, Outcome, choose, recorded_cycle, sources_at
@@ -159,7 +160,7 @@ def learned_and_general(bag: Path, folder: Path, friction: float, idle_drive: st
     learned, general = folder / "learned.npz", folder / "general.npz"
     numbers = ["--json", str(folder / "learn.json")]
     trial = ["--bag", str(bag), "--drive", "nycc", *tried, "--jobs", "2", "--output", str(learned)]
-    assert learn.main([*common, *trial, *numbers]) == command.DONE
+    assert learn.main([*common, *trial, *numbers]) == DONE
     cycles = [argument for name in ("ftp75", "hwfet", "nycc") for argument in ("--cycle", name)]
     assert solve_policy.main([*common, *cycles, "--output", str(general)]) == solve_policy.SOLVED
     return [learned, general]
@@ -212,7 +213,7 @@ class TestCommand:
         )
         arguments = ["--vehicle", CAR, "--bag", str(nycc_bag), "--cycle", "udds", "--grid", str(grid)]
         arguments += ["--weights", "0.5", "--jobs", "1", "--friction", "0.9", "0.5", "--output", str(tmp_path / "out")]
-        assert learn.main(arguments) == command.DONE
+        assert learn.main(arguments) == DONE
         text = capsys.readouterr().out
         assert "driven: nycc_drive (597 s)" in text or "driven: nycc_drive (598 s)" in text
         assert text.count("<- chosen") == 2 and text.count("nothing: cycles alone") == 2
@@ -234,7 +235,7 @@ class TestCommand:
         self, nycc_bag: Path, tmp_path: Path, capsys, arguments: list[str], said: str
     ) -> None:
         given = ["--vehicle", CAR, "--bag", str(nycc_bag), "--friction", "0.9", "--output", str(tmp_path / "p.npz")]
-        assert learn.main([*given, *arguments]) == command.BAD_INPUT
+        assert learn.main([*given, *arguments]) == BAD_INPUT
         captured = capsys.readouterr()
         assert captured.out == "" and captured.err.startswith("learn_policy: error: ") and said in captured.err
         assert list(tmp_path.iterdir()) == []
