@@ -38,17 +38,34 @@ _LASTING = 0.99
 
 
 class _Ahead(NamedTuple):
-    """What a demand leads to, whatever the share, where slip is settled; cells of the demand and of the speed after."""
+    """What a demand leads to, whatever the share, where slip is settled; the cells it and its end are in."""
 
     settled: Settled
     power: Cell
     speed: Cell
+    slip_front: Cell
+    slip_rear: Cell
 
 
 @kernel
 def _ahead(power_demand_w: float, situation: Situation, vehicle: VehicleParams, policy: PolicyTable) -> _Ahead:
     before = settled(power_demand_w, situation.speed_mps, vehicle, policy.problem)
-    return _Ahead(before, locate(policy.power_w, power_demand_w), locate(policy.speed_mps, before.speed_mps))
+    return _Ahead(
+        before,
+        locate(policy.power_w, power_demand_w),
+        locate(policy.speed_mps, before.speed_mps),
+        locate(policy.slip_front, 0.0),
+        locate(policy.slip_rear, 0.0),
+    )
+
+
+@kernel
+def _cell_of(k: int, policy: PolicyTable) -> Cell:
+    """Where the k-th share lies among the previous shares, which mostly are the same ones."""
+    axis, share = policy.previous_share, policy.share[k]
+    if k < axis.size and axis[k] == share:
+        return k, 0.0
+    return locate(axis, share)
 
 
 @kernel
@@ -62,14 +79,16 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
     budgeted = policy.changes_per_min > 0.0
     ahead = _ahead(situation.power_demand_w, situation, vehicle, policy)
     best = previous
-    best_cost = _cost_j(ahead, situation, previous, level, vehicle, policy) - LEAST_DIFFERENCE_W * policy.problem.dt_s
+    stay = locate(policy.previous_share, previous)
+    best_cost = _cost_j(ahead, situation, previous, stay, level, vehicle, policy)
+    best_cost -= LEAST_DIFFERENCE_W * policy.problem.dt_s
     for k in range(policy.share.size):
         share = policy.share[k]
         move = share - previous
         if move == 0.0 or not affordable(share, previous, used, policy.changes_per_min):
             continue
         switching = price * (price_units(move) if budgeted else abs(move)) + policy.switching_fixed_cost_j
-        cost = _cost_j(ahead, situation, share, level, vehicle, policy) + switching
+        cost = _cost_j(ahead, situation, share, _cell_of(k, policy), level, vehicle, policy) + switching
         if cost < best_cost:
             best_cost = cost
             best = share
@@ -78,7 +97,13 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
 
 @kernel
 def _cost_j(
-    ahead: _Ahead, situation: Situation, share: float, level: float, vehicle: VehicleParams, policy: PolicyTable
+    ahead: _Ahead,
+    situation: Situation,
+    share: float,
+    cell: Cell,
+    level: float,
+    vehicle: VehicleParams,
+    policy: PolicyTable,
 ) -> float:
     """Cost of a step with this share and of all that follows, J, in the mean over what the demand jitters between."""
     gain = situation.jitter.gain
@@ -88,17 +113,19 @@ def _cost_j(
         trust = TRUST
         steps = TRUST + (1.0 - TRUST) * WORTH_S / policy.problem.dt_s
     if gain > _LASTING:
-        return _demand_cost_j(ahead, demand_w, situation, share, level, steps, trust, vehicle, policy)
+        return _demand_cost_j(ahead, demand_w, situation, share, cell, level, steps, trust, vehicle, policy)
     steps += held_s(gain) / policy.problem.dt_s
-    total = gain * _demand_cost_j(ahead, demand_w, situation, share, level, steps, trust, vehicle, policy)
+    total = gain * _demand_cost_j(ahead, demand_w, situation, share, cell, level, steps, trust, vehicle, policy)
     weights = gain
     weight = gain
     for i in range(min(SAMPLES, situation.jitter.taken)):
         weight *= 1.0 - gain
         sample_w = situation.jitter.samples_w[i]
         sampled = _ahead(sample_w, situation, vehicle, policy)
-        total += weight * _demand_cost_j(sampled, sample_w, situation, share, level, steps, trust, vehicle, policy)
         weights += weight
+        total += weight * _demand_cost_j(
+            sampled, sample_w, situation, share, cell, level, steps, trust, vehicle, policy
+        )
     return total / weights
 
 
@@ -108,6 +135,7 @@ def _demand_cost_j(
     power_demand_w: float,
     situation: Situation,
     share: float,
+    cell: Cell,
     level: float,
     steps: float,
     trust: float,
@@ -116,11 +144,15 @@ def _demand_cost_j(
 ) -> float:
     """Right-hand side of eq. 31 for one demand and one share, J, without the price of the change.
 
-    `steps` is how many times the step's cost counts, `trust` the part of what follows.
+    `cell` is the share's among the previous shares, `steps` how many times the step's cost counts, `trust` the part of
+    what follows.
     """
     speed, problem = situation.speed_mps, policy.problem
     a, fa = ahead.power
     b, fb = ahead.speed
+    c, fc = ahead.slip_front
+    d, fd = ahead.slip_rear
+    e, fe = cell
     if problem.slip_model == SLIP_QUASI_STEADY:
         outcome = settled_step(ahead.settled, power_demand_w, speed, share, vehicle, problem)
     else:
@@ -128,9 +160,8 @@ def _demand_cost_j(
             power_demand_w, speed, situation.front_slip, situation.rear_slip, share, vehicle, problem
         )
         b, fb = locate(policy.speed_mps, outcome.speed_mps)
-    c, fc = locate(policy.slip_front, outcome.slip_front)
-    d, fd = locate(policy.slip_rear, outcome.slip_rear)
-    e, fe = locate(policy.previous_share, share)
+        c, fc = locate(policy.slip_front, outcome.slip_front)
+        d, fd = locate(policy.slip_rear, outcome.slip_rear)
     if level <= 0.0:
         follow_up = interpolate5(policy.expected_cost_j, a, fa, b, fb, c, fc, d, fd, e, fe)
     else:

@@ -16,6 +16,9 @@ RANGES = {
     "curvature_factor": (-10.0, 1.0),
 }
 
+#: A step of the inverse this small (relative) leaves rounding.
+_SMALL = 3e-6
+
 
 @kernel
 def friction_coefficient(slip: float, peak_friction: float, coefficients: TyreCoefficients) -> float:
@@ -46,13 +49,20 @@ def slip_at_friction(friction: float, peak_friction: float, coefficients: TyreCo
     if peak <= 0.0 or friction == 0.0:
         return 0.0
     ratio = min(abs(friction) / peak, 1.0)
-    # sin(C atan(y)) = ratio  ->  y; then (1 - E) x + E atan(x) = y by Newton: the left side rises and bends down.
+    # sin(C atan(y)) = ratio  ->  y; then (1 - E) x + E atan(x) = y, from its series at small slips: by Halley's method,
+    # and where the curvature is no small correction by Newton's, since the left side rises and bends one way.
     y = math.tan(math.asin(ratio) / c)
-    x = y
+    x = y + e / 3.0 * y * min(y * y, 0.25)
     for _ in range(50):
-        step = ((1.0 - e) * x + e * math.atan(x) - y) / (1.0 - e * x * x / (1.0 + x * x))
+        per = 1.0 / (1.0 + x * x)
+        slope = 1.0 - e * x * x * per
+        step = ((1.0 - e) * x + e * math.atan(x) - y) / slope
+        bend = -e * x * per * per * step / slope
+        if abs(bend) < 0.25:
+            step /= 1.0 - bend
         x -= step
-        if abs(step) <= 1e-13 * (1.0 + abs(x)):
+        # What is left goes with the cube of the step.
+        if abs(step) <= _SMALL * (1.0 + abs(x)):
             break
     slip = x / b
     return slip if friction > 0.0 else -slip
