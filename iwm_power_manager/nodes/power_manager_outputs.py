@@ -90,9 +90,13 @@ class Outputs:
     def publish(self, answer: list[tuple[str, bytes]], may_send: Callable[[float], bool] = lambda _: True) -> bool:
         """Publish messages, each only if `may_send` allows it at that moment (monotonic s); False if it did not."""
         for topic, data in answer:
+            publisher = self._publishers[topic]
+            send = publisher.handle.publish_raw  # nothing more stands between the look at the clock and DDS
+            if not publisher.is_activated:
+                continue
             if not may_send(time.monotonic()):
                 return False
-            self._publishers[topic].publish(data)
+            send(data)
         return True
 
     def zero(self, now_ns: int) -> None:

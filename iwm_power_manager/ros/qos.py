@@ -3,7 +3,8 @@
 
 Real time follows Autoware's convention for commands and status: reliable, volatile, keep the last one; a control loop
 wants the newest value, not a queue of old ones. Inputs are asked for best effort, which both kinds of publishers meet.
-Commands offer a deadline and liveliness, so that who obeys them can have DDS tell when they stay away. In lock-step
+Commands offer a deadline and liveliness, so that who obeys them can have DDS tell when they stay away, and a lifespan:
+DDS drops what comes later, at a subscriber that asks for it (Fast DDS) or at all of them (CycloneDDS). In lock-step
 every message counts, so the queue is deep enough that none can be overwritten while one side is busy.
 """
 
@@ -38,12 +39,12 @@ def profile(*, lockstep: bool, depth: int = 0, reliability: str = "reliable") ->
     )
 
 
-#: Control periods after which a command is overdue, and after which its node counts as dead.
-DEADLINE_PERIODS, LEASE_PERIODS = 3.0, 10.0
+#: Control periods after which a command is overdue, after which DDS drops it, and after which its node counts as dead.
+DEADLINE_PERIODS, LIFESPAN_PERIODS, LEASE_PERIODS = 3.0, 5.0, 10.0
 
 
 def command_profile(period_s: float | None) -> QoSProfile:
-    """Profile of a command topic: reliable, with a deadline and the liveliness of its own writes.
+    """Profile of a command topic: reliable, with a deadline, a lifespan and the liveliness of its own writes.
 
     Parameters
     ----------
@@ -53,6 +54,7 @@ def command_profile(period_s: float | None) -> QoSProfile:
         return profile(lockstep=True)
     found = profile(lockstep=False)
     found.deadline = Duration(seconds=DEADLINE_PERIODS * period_s)
+    found.lifespan = Duration(seconds=LIFESPAN_PERIODS * period_s)
     found.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
     found.liveliness_lease_duration = Duration(seconds=LEASE_PERIODS * period_s)
     return found

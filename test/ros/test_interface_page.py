@@ -129,6 +129,7 @@ def check_quality(found, meant) -> None:
     if meant["deadline_periods"]:
         assert found.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC
         assert found.deadline == Duration(seconds=meant["deadline_periods"] * PERIOD_S)
+        assert found.lifespan == Duration(seconds=meant["lifespan_periods"] * PERIOD_S)
         assert found.liveliness_lease_duration == Duration(seconds=meant["lease_periods"] * PERIOD_S)
     else:
         assert found.liveliness == LivelinessPolicy.AUTOMATIC

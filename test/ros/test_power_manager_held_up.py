@@ -14,13 +14,16 @@ from typing import NamedTuple
 
 import pytest
 from rolling_car import Heard, RollingCar
+from sensor_msgs.msg import JointState
 
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.control.thresholds import Thresholds
+from iwm_power_manager.ros import messages, qos
 
 T = Thresholds()
 DRIVE_W, BRAKE_W = 5000.0, -6000.0
 NS_PER_S = 1e9
+PERIOD_S = 0.01
 
 
 class Hold(NamedTuple):
@@ -110,6 +113,31 @@ def run(start_pair, count: int, seed: int) -> list[Hold]:
 
 def test_no_old_command_is_published_after_a_stop(start_pair) -> None:
     run(start_pair, 5, 1)
+
+
+def test_what_dds_held_back_is_not_heard_by_who_asks_for_a_lifespan(start_pair) -> None:
+    """Stops aimed at the moment of publishing, where every third finds a command inside DDS."""
+    pair = start_pair()
+    bench = pair.bench
+    bench.connect()
+    car = RollingCar(bench, 10.0)
+    offered = qos.command_profile(PERIOD_S)
+    fresh: list[dict[str, int]] = []
+    for topic in (messages.WHEEL_TORQUE_COMMAND, messages.FRICTION_BRAKE_COMMAND):
+        bench.node.create_subscription(JointState, topic, lambda _, info: fresh.append(info), offered)
+    source = random.Random(1)
+    for _ in range(15):
+        heard = len(fresh)
+        car.roll(lambda heard=heard: len(fresh) > heard + 10, "commands", lambda: DRIVE_W)
+        due_ns = fresh[-1]["source_timestamp"] + PERIOD_S * NS_PER_S + source.uniform(-1.5e5, 2.5e5)
+        while time.time_ns() < due_ns:
+            pass
+        os.kill(pair.running.process.pid, signal.SIGSTOP)
+        due_s = time.monotonic() + 1.2 * T.command_oldest_s
+        car.roll(lambda due_s=due_s: time.monotonic() >= due_s, "the end of the stop", lambda: DRIVE_W)
+        os.kill(pair.running.process.pid, signal.SIGCONT)
+    lifespan_ns = offered.lifespan.nanoseconds
+    assert max(info["received_timestamp"] - info["source_timestamp"] for info in fresh) <= lifespan_ns
 
 
 @pytest.mark.nightly

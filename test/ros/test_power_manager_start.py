@@ -45,7 +45,7 @@ def fails_with(folder: Path, args: list[str]) -> str:
         ({"friction": ".nan"}, "parameter friction: nan is not allowed"),
     ],
 )
-def test_what_it_cannot_start_with_gives_one_line_and_exit_code_1(tmp_path, parameters, expected) -> None:
+def test_what_it_cannot_start_with_gives_one_line(tmp_path, parameters, expected) -> None:
     assert expected in fails_with(tmp_path, arguments(parameters))
 
 
