@@ -12,12 +12,14 @@ from iwm_power_manager.control.settings import GATE_MODE_OFF, default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import (
     LIMIT_FRICTION_BRAKE,
+    LIMIT_REGENERATION,
     LIMIT_SLEW,
     LIMIT_SLIP,
     ControllerState,
     Measurement,
     initial_state,
 )
+from iwm_power_manager.model.chassis import aerodynamic_force_n, rolling_force_n
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 
@@ -272,3 +274,227 @@ def test_a_mirrored_car_gets_mirrored_commands(rims, demand, torques, heats, gai
         assert getattr(one_way[0], name) == pytest.approx(mirrored(getattr(other_way[0], name)), rel=1e-9, abs=1e-6)
     for here, there in zip(one_way[1].wheels, mirrored(other_way[1].wheels), strict=True):
         assert here == pytest.approx(there, rel=1e-9, abs=1e-6)
+
+
+# --- an axle has its own settings, brakes, motors and memory ---------------------------------------------------------
+
+AXLES = pytest.mark.parametrize("axle", ["front", "rear"])
+FRONT, REAR = slice(0, 2), slice(2, 4)
+
+
+def of(axle, values):
+    return values[FRONT if axle == "front" else REAR]
+
+
+def changed(axle, part, **numbers):
+    """The car with other numbers of a part of one axle."""
+    own = getattr(CAR, axle)
+    return CAR._replace(**{axle: own._replace(**{part: getattr(own, part)._replace(**numbers)})})
+
+
+@pytest.mark.parametrize("longer", [1.0, -1.0])
+def test_while_the_front_brakes_unequally_each_wheel_is_held_at_the_slip_meant_for_it(longer):
+    tuned = LIMITER._replace(
+        slip_target=0.12, unequal_slip_target=0.03, unequal_low_slip_target=0.08, unequal_rear_slip_target=0.05
+    )
+    wheels = tuple(0.98 * rolls for rolls in rolling())
+    before = remembered(speed_radps=wheels)._replace(front_unequal_s=longer, rear_unequal_s=0.0)
+
+    def given(state, settings):
+        _, after = step(measured(-300e3, wheels), state, settings)
+        return [abs(wheel.total_nm) for wheel in after.wheels]
+
+    alone = {
+        target: given(before._replace(front_unequal_s=0.0), tuned._replace(slip_target=target))
+        for target in (0.03, 0.08, 0.05)
+    }
+    front = (0.03, 0.08) if longer > 0.0 else (0.08, 0.03)
+    expected = [alone[target][i] for i, target in enumerate((*front, 0.05, 0.05))]
+    assert given(before, tuned) == pytest.approx(expected)
+    assert len({round(total) for total in (alone[0.03][0], alone[0.08][0], alone[0.05][0])}) == 3
+    rear_only = before._replace(front_unequal_s=0.0, rear_unequal_s=longer)
+    assert given(rear_only, tuned) == pytest.approx(given(before._replace(front_unequal_s=0.0), tuned))
+
+
+@AXLES
+@pytest.mark.parametrize(
+    ("now_nm", "growth_nmps", "most_nm", "moment_nm"),
+    [(240.0, 0.0, 5e3, 240.0), (0.0, 100.0, 5e3, 200.0), (1e3, 0.0, 250.0, 250.0)],
+)
+def test_an_axle_s_yaw_budget_is_its_own(axle, now_nm, growth_nmps, most_nm, moment_nm):
+    other = "rear" if axle == "front" else "front"
+    own = {"yaw_nm": now_nm, "yaw_growth_nmps": growth_nmps, "yaw_most_nm": most_nm}
+    none = dict.fromkeys(own, 0.0)
+    budgets = {f"{axle}_{name}": value for name, value in own.items()}
+    budgets |= {f"{other}_{name}": value for name, value in none.items()}
+    tuned = LIMITER._replace(**budgets, yaw_speed_mps=SPEED)
+    # The right wheels skid and get nothing: the left ones may have what the budget allows.
+    wheels = tuple(rolls * (0.5 if i % 2 else 1.0) for i, rolls in enumerate(rolling()))
+    before = remembered(speed_radps=wheels)._replace(**{f"{axle}_unequal_s": 2.0, f"{other}_unequal_s": 0.0})
+    _, after = step(measured(-300e3, wheels), before, tuned)
+    left_nm, right_nm = of(axle, [abs(wheel.total_nm) for wheel in after.wheels])
+    part = getattr(CAR, axle)
+    assert (left_nm - right_nm) * part.track_width_m / 2.0 / part.wheel.radius_m == pytest.approx(moment_nm)
+    assert of(other, [wheel.total_nm for wheel in after.wheels]) == [0.0, 0.0]
+
+
+@AXLES
+def test_an_axle_without_brakes_says_so_and_the_other_speaks_of_its_brakes(axle):
+    command, _ = law.step(
+        measured(-300e3), remembered(), OFF, changed(axle, "friction_brake", max_torque_nm=0.0), TABLE
+    )
+    assert command.limits & LIMIT_FRICTION_BRAKE
+    assert command.limits & LIMIT_REGENERATION
+
+
+@AXLES
+def test_an_axle_that_falls_short_alone_says_what_keeps_it(axle):
+    car = changed(axle, "friction_brake", max_torque_nm=0.0)
+    motor = getattr(car, axle).motor
+    car = car._replace(**{axle: getattr(car, axle)._replace(motor=motor._replace(regeneration_torque_nm=5.0))})
+    command, after = law.step(measured(-8e3), remembered(), OFF, car, TABLE)
+    given_w = sum(wheel.total_nm * rolls for wheel, rolls in zip(after.wheels, rolling(), strict=True))
+    assert given_w == pytest.approx(-8e3)
+    assert command.limits & LIMIT_REGENERATION
+
+
+@AXLES
+def test_friction_that_holds_against_motors_on_their_way_down_ends_at_the_axle_s_own_brakes(axle):
+    command, _ = step(measured(-300e3), remembered(motor_nm=(120.0,) * 4), OFF._replace(slew_down_nmps=100.0))
+    assert min(command.motor_torque_nm) > 0.0
+    most = getattr(CAR, axle).friction_brake.max_torque_nm
+    assert of(axle, command.friction_torque_nm) == pytest.approx((-most, -most))
+
+
+@AXLES
+def test_a_motor_warms_up_as_its_own_axle_s_motors_do(axle):
+    car = changed(axle, "motor", thermal_time_constant_s=1e9)
+    _, after = law.step(measured(20e3), remembered(motor_nm=(80.0,) * 4), OFF, car, TABLE)
+    heats = [wheel.heat for wheel in after.wheels]
+    assert max(of(axle, heats)) < 1e-9 < min(of("rear" if axle == "front" else "front", heats))
+
+
+@AXLES
+@pytest.mark.parametrize("side", [0, 1])
+def test_an_axle_counts_as_unequal_where_its_own_wheels_brake_unequally_or_would(axle, side):
+    other = "rear" if axle == "front" else "front"
+    none = {name: getattr(CAR, name).friction_brake._replace(max_torque_nm=0.0) for name in ("front", "rear")}
+    car = CAR._replace(**{name: getattr(CAR, name)._replace(friction_brake=brake) for name, brake in none.items()})
+    # Half of a motor is gone: an axle's wheels brake alike as long as little is asked of them.
+    gain = one(2 * (axle == "rear") + side, 0.5, (1.0,) * 4)
+
+    at_once = OFF._replace(slew_regeneration_nmps=1e6)
+
+    def unequal_s(demand, tuned):
+        _, after = law.step(measured(demand, gain=gain), remembered(), tuned, car, TABLE)
+        left, right = of(axle, [wheel.total_nm for wheel in after.wheels])
+        assert getattr(after, f"{other}_unequal_s") == 0.0
+        return left == right, getattr(after, f"{axle}_unequal_s")
+
+    more = 0.01 if side else -0.01
+    assert unequal_s(-1e3, at_once) == (True, 0.0)
+    assert unequal_s(-8e3, at_once) == (False, more)
+    select_low = at_once._replace(**{f"{axle}_yaw_nm": 0.0, f"{axle}_yaw_most_nm": 0.0})
+    assert unequal_s(-8e3, select_low) == (True, more)
+    # The other axle falls short, and this one does not.
+    weak = getattr(car, other).motor._replace(regeneration_torque_nm=1.0)
+    car = car._replace(**{other: getattr(car, other)._replace(motor=weak)})
+    assert unequal_s(-1e3, at_once) == (True, 0.0)
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_rooms_that_differ_by_a_fifth_of_the_larger_one_are_alike(side):
+    brakes = CAR.front.friction_brake._replace(max_torque_nm=0.0)
+    car = CAR._replace(front=CAR.front._replace(friction_brake=brakes))
+    for gain, more in ((0.81, 0.0), (0.79, 0.01 if side else -0.01)):
+        gains = one(side, gain, (1.0,) * 4)
+        _, after = law.step(measured(-300e3, gain=gains), remembered(), OFF, car, TABLE)
+        assert after.front_unequal_s == more
+
+
+def test_the_friction_of_each_side_is_shown_as_that_side_s():
+    start = remembered()
+    grip = start.friction
+    known = grip._replace(
+        left=grip.left._replace(friction=0.3, confidence=0.9), right=grip.right._replace(friction=0.7, confidence=0.5)
+    )
+    command, after = step(measured(1e3), start._replace(friction=known))
+    found = after.friction
+    assert (command.left_friction, command.left_confidence) == (found.left.friction, found.left.confidence)
+    assert (command.right_friction, command.right_confidence) == (found.right.friction, found.right.confidence)
+    assert command.left_friction < 0.5 < command.right_friction
+    assert command.left_confidence > command.right_confidence
+
+
+def test_a_car_that_rolls_back_is_held_at_the_rim_of_its_front_wheels():
+    command, _ = step(measured(1500.0, rolling(-0.5), speed=-0.5), remembered(-0.5), OFF)
+    assert command.hold_nm == pytest.approx(
+        0.25 * 0.25 * CAR.chassis.mass_kg * 9.81 * CAR.front.wheel.radius_m, rel=1e-3
+    )
+
+
+@pytest.mark.parametrize("force_n", [2000.0, -2000.0])
+def test_wheels_of_two_sizes_are_believed_and_lead_the_speed_alike(force_n):
+    """A second of driving or braking, with and without the speed sensor."""
+    for sensor in (True, False):
+        state, speed = remembered(), SPEED
+        resisting_n = rolling_force_n(0.0, CAR.chassis) + aerodynamic_force_n(SPEED, CAR.chassis)
+        acceleration = (force_n - resisting_n) / CAR.chassis.mass_kg
+        axles = (CAR.front, CAR.front, CAR.rear, CAR.rear)
+        torques = tuple(
+            0.25 * force_n * a.wheel.radius_m + a.wheel.inertia_kgm2 * acceleration / a.wheel.radius_m for a in axles
+        )
+        for _ in range(100):
+            speed += 0.01 * acceleration
+            wheels = tuple(w._replace(total_nm=torque) for w, torque in zip(state.wheels, torques, strict=True))
+            shown = measured(0.0, rolling(speed), speed=speed if sensor else float("nan"))
+            command, state = step(shown, state._replace(wheels=wheels))
+            assert command.doubted == (0 if sensor else 16)
+            assert command.speed_mps == pytest.approx(speed, abs=0.15)
+
+
+def doubted_after(state, wheels, **every_step):
+    """What is doubted after a tenth of a second with these wheel speeds; `every_step` : of each wheel's memory."""
+    for _ in range(10):
+        remembered_wheels = tuple(
+            wheel._replace(**{name: values[i] for name, values in every_step.items()})
+            for i, wheel in enumerate(state.wheels)
+        )
+        command, state = step(measured(0.0, wheels), state._replace(wheels=remembered_wheels), OFF)
+    return command.doubted
+
+
+@WHEELS
+def test_a_gated_wheel_should_be_back_and_one_that_is_not_may_be_a_little_away(wheel):
+    wheels = one(wheel, (SPEED - 1.0) / RADII[wheel], rolling())
+    start = remembered(speed_radps=wheels)
+    nothing = (0.0,) * 4
+    gated = one(wheel, True, (False,) * 4)
+    assert doubted_after(start, wheels, gated=gated, total_nm=nothing) == 1 << wheel
+    assert doubted_after(start, wheels, gated=tuple(not g for g in gated), total_nm=nothing) == 0
+
+
+@WHEELS
+def test_a_wheel_is_free_below_a_twentieth_of_its_own_axle_s_load(wheel):
+    chassis = CAR.chassis
+    a, b = chassis.front_axle_to_cg_m, chassis.rear_axle_to_cg_m
+    load_n = 0.5 * chassis.mass_kg * 9.81 * (b if wheel < 2 else a) / (a + b)
+    free_nm = 0.05 * load_n * RADII[wheel]
+    wheels = one(wheel, (SPEED - 2.5) / RADII[wheel], rolling())
+    start = remembered(speed_radps=wheels)
+    for part, doubted in ((0.97, 1 << wheel), (1.03, 0)):
+        torques = one(wheel, -part * free_nm, (0.0,) * 4)
+        assert doubted_after(start, wheels, gated=(False,) * 4, total_nm=torques) == doubted
+
+
+def test_five_speeds_that_agree_are_right_also_where_front_and_rear_wheels_differ_in_size():
+    """A reference that the forces led astray is given up: rims are compared, each wheel's by its own radius."""
+    state = remembered(12.0, speed_radps=rolling(20.0))
+    state = state._replace(
+        motion=state.motion._replace(speed_mps=12.0, shown_mps=20.0, wheel_doubt_s=(0.5,) * 4, doubt_s=0.5)
+    )
+    for k in range(130):
+        speed = 20.0 + 0.001 * k
+        command, state = step(measured(0.0, rolling(speed), speed=speed), state, OFF)
+    assert command.doubted == 0
+    assert command.speed_mps == pytest.approx(speed, abs=0.2)
