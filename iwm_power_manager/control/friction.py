@@ -48,8 +48,9 @@ CURVE_MPS2 = 4.0
 #: within the second time.
 SHORT_S = 0.02
 PROMPT_S = 0.05
-#: The slope, once it is known, is believed within this time, s.
-SLOPE_S = 1.0
+#: The slope is believed within this time, s, as far as it is known: it is a mean over `friction_memory_s` already, and
+#: until it counts the split is that of another road.
+SLOPE_S = 0.1
 #: Slip that no tyre model is better than, and the relative error at which a slope is half believed.
 LEAST_ERROR_SLIP = 0.0005
 HALF_BELIEVED = 0.1

@@ -105,6 +105,14 @@ def test_gentle_driving_with_true_sensors_tells_the_friction_within_seconds(fric
     assert grip.assumed == pytest.approx(friction, abs=0.05)
 
 
+@pytest.mark.parametrize("friction", [0.2, 0.5])
+def test_what_is_known_of_the_slope_is_believed_within_a_third_of_a_second(friction):
+    drive = Drive()
+    known = [drive.step((friction,) * 4, 0.08 * math.sin(k / 40.0)) for k in range(300)]
+    first = next(k for k, grip in enumerate(known) if grip.left.confidence > 0.5)
+    assert known[first + 33].assumed == pytest.approx(friction, rel=0.2)
+
+
 @pytest.mark.parametrize("friction", [0.2, 0.5, 0.9])
 @pytest.mark.parametrize("offset", [-0.01, 0.01])
 def test_a_speed_sensor_that_is_wrong_by_a_hundredth_does_not_bias_it(friction, offset):
@@ -260,7 +268,7 @@ def test_the_slope_is_that_of_all_points_at_once(frictions, used, speed, car):
                 continue  # rounding alone tells such points apart
             told, belief = oracle.slope(side, drive.settings, car.front.tyre, DT)
             prior, rise = drive.settings.friction_prior, drive.settings.friction_rise_per_s * DT
-            change = belief * (told - was.friction) * DT / 1.0
+            change = belief * (told - was.friction) * DT / 0.1
             change += (1.0 - belief) * (prior - was.friction) * DT / drive.settings.friction_return_s
             assert now.friction == pytest.approx(was.friction + min(change, rise), rel=1e-6, abs=1e-7)
             faded = was.confidence * (1.0 - DT / (drive.settings.friction_return_s + DT))
