@@ -42,14 +42,14 @@ docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study an
 bench: setup-dev  ## Time control path, bags, solver and closed loop on this machine, each beside a peer (an hour)
 	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit $$?; done
 
-##@ Documentation
-.PHONY: docs
-docs: setup-dev  ## The pages, every --help and the API as a site: build/docs/html/index.html (2 min)
-	@$(BIN)/python scripts/docs_site $(ARGS)
-
 bench-peers: setup-dev  ## FASTSim in an environment of its own, runs/peers: a peer of benchmarks/performance.py (1 min)
 	@test -x runs/peers/bin/python || $(BIN)/python -m venv runs/peers
 	@runs/peers/bin/python -m pip install --quiet --require-hashes -r benchmarks/requirements.txt
+
+##@ Documentation
+.PHONY: docs
+docs: setup-dev  ## The pages, every --help and the API as a site: build/docs/html/index.html (2 min; the first time also set-up, 3 min)
+	@$(BIN)/python scripts/docs_site $(ARGS)
 
 ##@ Safety
 .PHONY: faults soak nightly coverage mutation

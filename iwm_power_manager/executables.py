@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import select
 import signal
 import sys
 from functools import partial
@@ -31,8 +32,29 @@ def run(module: str, interrupted: int) -> int:
     Returns
     -------
     int
-        Exit code.
+        Exit code; as if all was done, where whoever reads the output has had enough of it, as `head` has.
     """
+    try:
+        try:
+            return _ended(module, interrupted)
+        finally:
+            if sys.stdout:
+                sys.stdout.flush()
+    except BrokenPipeError:
+        if not _nobody_reads():
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # for what the interpreter flushes at its end
+        return DONE
+
+
+def _nobody_reads() -> bool:
+    """Whether standard output is a pipe that was closed at its other end."""
+    output = select.poll()
+    output.register(1, 0)
+    return any(event & select.POLLERR for _, event in output.poll(0))
+
+
+def _ended(module: str, interrupted: int) -> int:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored, as under nohup
         # No exception: libraries make something else of one that meets them half imported.
         signal.signal(signal.SIGINT, lambda *_: os._exit(interrupted))

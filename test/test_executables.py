@@ -127,3 +127,44 @@ def test_every_executable_names_a_module_with_a_main(name) -> None:
     module, ended = command.args
     assert callable(executables.importlib.import_module(module).main)
     assert ended == (0 if name in NODES else 130)
+
+
+def nobody_reading(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A Python program whose standard output is a pipe that is closed at its other end."""
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        command = [sys.executable, "-c", code, *arguments]
+        return subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    finally:
+        os.close(write)
+
+
+@pytest.mark.parametrize("name", [*NODES, *COMMANDS, "set_parameter", "watch_car"])
+def test_a_closed_pipe_ends_a_command_without_a_word(name) -> None:
+    package = "iwm_power_manager" if hasattr(executables, name) else "iwm_sim"
+    ended = nobody_reading(f"import sys; from {package}.executables import {name}; sys.exit({name}())", "--help")
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+#: A command that prints far more than a pipe holds.
+TALKATIVE = """\
+import sys, types
+from iwm_power_manager import executables
+sys.modules["some_module"] = types.SimpleNamespace(main=lambda: print("line\\n" * 100_000))
+sys.exit(executables.run("some_module", 130))
+"""
+
+
+def test_head_takes_a_line_and_nothing_else_is_said() -> None:
+    script = '"$0" -c "$1" | head -1; echo "${PIPESTATUS[@]}"'
+    command = ["bash", "-c", script, sys.executable, TALKATIVE]
+    ended = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert (ended.stdout, ended.stderr) == ("line\n0 0\n", "")
+
+
+def test_a_broken_pipe_to_something_else_is_no_end_of_the_output() -> None:
+    program = TALKATIVE.replace('print("line\\n" * 100_000)', "(_ for _ in ()).throw(BrokenPipeError('a worker'))")
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.endswith("BrokenPipeError: a worker\n")

@@ -198,6 +198,11 @@ def shown(name: str, value: Any) -> Any:
     return next((key for key, code in TABLE[name].choices.items() if code == value), value)
 
 
+def as_shown(settings: Settings) -> dict[str, Any]:
+    """All settings by name, choices by theirs."""
+    return {name: shown(name, value) for name, value in settings._asdict().items()}
+
+
 def from_shown(values: Mapping[str, Any]) -> dict[str, Any]:
     """Those of `values` that are settings, choices given by name, as `Settings` takes them."""
     return {

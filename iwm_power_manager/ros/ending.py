@@ -65,7 +65,8 @@ def bounded(code: int, limit_s: float | None = None) -> Iterator[None]:
     code : exit code of the process if it has to be ended; nothing is printed, no destructor runs then
     limit_s : longest time for the body, the shutdown of rclpy and the garbage in between; None: `LIMIT_S`
     """
-    sys.stdout.flush()
+    with suppress(BrokenPipeError):  # nobody reads it: `executables` has a word for that, and DDS is left all the same
+        sys.stdout.flush()
     sys.stderr.flush()
     realtime.give_up_priority()
     with _deadline(code, LIMIT_S if limit_s is None else limit_s), one_processor():

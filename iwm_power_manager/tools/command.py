@@ -35,9 +35,6 @@ def ended(name: str, work: Callable[[], int | None]) -> int:
     except KeyboardInterrupt:
         print(f"{name}: interrupted; nothing half-written is left", file=sys.stderr)
         return INTERRUPTED
-    except BrokenPipeError:
-        sys.stderr.close()  # whoever read our output has had enough
-        return DONE
 
 
 def write_json(path: Path | str, values: Any) -> None:

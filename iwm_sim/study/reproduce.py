@@ -19,7 +19,7 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from iwm_power_manager import __version__
-from iwm_power_manager.control.settings import default_settings
+from iwm_power_manager.control.settings import as_shown, default_settings
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import VehicleParams
@@ -152,7 +152,7 @@ def _study(
         vehicle_hashes={idle_drive: policies.car(idle_drive).hash for idle_drive in IDLE_DRIVES},
         cycles={name: cycle.sha256 for name, cycle in driven.items()},
         strategy=STRATEGY,
-        settings=settings._asdict(),
+        settings=as_shown(settings),
         policies={
             labels.OURS: [_identity(key, policies.ours(*key)) for key in keys()],
             **{name: [_identity(key, policies.of_variant(name, *key)) for key in keys()] for name in VARIANTS},

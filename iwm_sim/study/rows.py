@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from iwm_power_manager.control.strategies import STRATEGIES
+from iwm_power_manager.control.settings import as_shown
 from iwm_sim.metrics import Metrics
 from iwm_sim.study.cases import Case, Result, cycle_of, policy_of, vehicle_of
 from iwm_sim.study.names import REFERENCE
@@ -186,7 +186,7 @@ def _made_with(case: Case) -> dict[str, Any]:
         "initial_soc": case.soc,
         "noise": case.noise._asdict(),
         "plant_changes": {f"{change.section}.{change.name}": change.value for change in case.plant},
-        "settings": case.settings._replace(strategy=STRATEGIES[case.strategy].code)._asdict(),
+        "settings": as_shown(case.settings) | {"strategy": case.strategy},
         "rule": list(case.rule) or None,
         "preview_switching_cost_j": (
             [case.switching_cost_j, case.switching_fixed_cost_j] if case.strategy == "preview" else None

@@ -11,7 +11,6 @@ import numpy as np
 
 from iwm_power_manager.control import law
 from iwm_power_manager.control.settings import GATE_MODES, default_settings
-from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import initial_state
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
@@ -59,7 +58,6 @@ class Stopped:
     friction: float
     gate_mode: str
     strategy: str
-    strategy_code: int
     distance_m: float
     best_m: float
     best_slip: float
@@ -123,7 +121,6 @@ def emergency_stop(stop: Stop) -> Stopped:
         friction=stop.friction,
         gate_mode=stop.gate_mode,
         strategy=stop.strategy,
-        strategy_code=STRATEGIES[stop.strategy].code,
         distance_m=float(car.distance_m),
         best_m=best_m,
         best_slip=-best_slip,

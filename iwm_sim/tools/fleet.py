@@ -117,12 +117,14 @@ def _given(options: argparse.Namespace) -> dict[str, Any]:
 def _run(options: argparse.Namespace) -> None:
     """Solve what is needed, then drive."""
     from iwm_sim.fleet.plan import load_plan, needed
+
+    plan = load_plan(options.file, _given(options))  # first: a name that is misspelled needs no library
+    _check_libraries()
     from iwm_sim.fleet.run import runner
     from iwm_sim.fleet.store import Store
     from iwm_sim.fleet.task import Drive, Road, Solve
     from iwm_sim.study.driving import progress_of, silent, tell
 
-    plan = load_plan(options.file, _given(options))
     parts: list[tuple[type[Any], Sequence[Any]]] = [(Solve, plan.solves)]
     if options.command == "drive":
         if not plan.drives and not plan.roads:
@@ -148,17 +150,21 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def _report(options: argparse.Namespace) -> None:
+    _check_libraries()
     from iwm_sim.fleet import report
 
     report.make(options.folder, options.page or options.folder / "fleet.html", options.picture, options.json)
 
 
-def _work(options: argparse.Namespace) -> None:
+def _check_libraries() -> None:
     for name in ("distributed", "pyarrow"):
         try:
             importlib.import_module(name)
         except ImportError:
             raise ConfigError(name, "", "is not installed", "pip install distributed pyarrow") from None
+
+
+def _work(options: argparse.Namespace) -> None:
     (_report if options.command == "report" else _run)(options)
 
 

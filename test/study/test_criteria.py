@@ -42,7 +42,6 @@ STOP = Stopped(
     friction=0.9,
     gate_mode="limiter",
     strategy="equal",
-    strategy_code=0,
     distance_m=37.0,
     best_m=36.0,
     best_slip=-0.18,

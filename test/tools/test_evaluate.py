@@ -81,7 +81,8 @@ def test_law_settings_reach_the_law(hill, tmp_path):
     assert evaluate.main([*arguments, *law, *run, "--json", str(out), "--quiet"]) == 0
     row = rows_of(out)[1]
     settings = row["settings"]
-    assert (settings["gate_mode"], settings["gate_driving"], settings["gate_hysteresis"]) == (1, False, 0.0)
+    assert (settings["gate_mode"], settings["gate_driving"], settings["gate_hysteresis"]) == ("table2", False, 0.0)
+    assert settings["strategy"] == "instantaneous_slip"
     assert (settings["switching_power_w"], settings["critical_slip"]) == (5.0, 0.1)
     assert settings["slip_target"] < settings["critical_slip"]
     assert (row["assumed_friction"], row["dt_s"], row["initial_soc"]) == (0.5, 0.02, 0.5)

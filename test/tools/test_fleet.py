@@ -31,6 +31,14 @@ def test_a_small_fleet_is_driven_and_its_page_made(hill, tmp_path, capsys):
     assert "instantaneous       2     2" in capsys.readouterr().out
 
 
+def test_a_misspelled_name_is_said_before_a_library_that_is_not_there(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert fleet.main(["drive", "smal", "--output", str(tmp_path / "study")]) == 2
+    assert "smal" in (said := capsys.readouterr().err) and "small" in said and "distributed" not in said
+    assert fleet.main(["drive", "small", "--output", str(tmp_path / "study")]) == 2
+    assert "distributed: is not installed" in capsys.readouterr().err
+
+
 def test_policies_are_solved_alone(small_grid, tmp_path, capsys):
     study = tmp_path / "study"
     solve = ["solve", *CAR, "--friction", "0.9", "0.5", "--grid", str(small_grid), "--jobs", "1"]
