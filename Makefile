@@ -60,7 +60,7 @@ soak: setup-dev  ## 30 minutes in real time at 100 Hz: memory, deadlines, counts
 	@$(BIN)/python -m campaigns.soak $(ARGS)
 
 nightly: setup-dev  ## The tests that are too long for every run, and far more random cases in the others (hours)
-	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest -m "nightly or not nightly" $(PYTEST_ARGS)
+	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest -m "nightly or not nightly" --timeout 7200 $(PYTEST_ARGS)
 
 # Compiled kernels leave no trace, so the safety code is covered as plain Python.
 SAFETY := iwm_power_manager/model/gate.py,iwm_power_manager/model/limits.py,iwm_power_manager/model/torque.py,iwm_power_manager/control/*

@@ -56,7 +56,7 @@ class Announcements:
     def activated(self) -> None:
         """Forget the modes of before."""
         self._mode = MODE_WAITING
-        self._stale = 0
+        self._told: int | None = None  # bits of the inputs whose absence has been told
         self._was_degraded = False
         self._torque_seen = False
         self._late_s: dict[str, float] = {}
@@ -132,7 +132,10 @@ class Announcements:
             waits = self._missing(controller, topics, trouble, ~0, now_ns)
             if waits:
                 self._logger.info(f"waits for {waits}")
-        if (mode == MODE_DEGRADED and mode != self._mode) or (stale & ~self._stale and mode == MODE_DEGRADED):
+        if mode in (MODE_NORMAL, MODE_WAITING):
+            self._told = None
+        if mode == MODE_DEGRADED and (self._told is None or stale & ~self._told):
+            self._told = stale | (self._told or 0)  # each once until all is well: flapping must not fill the log
             missing = self._missing(controller, topics, trouble, stale, now_ns) or self._was_late()
             self._logger.warning(f"degraded, motor torque fades: {missing}")
         elif mode == MODE_NORMAL and mode != self._mode:
@@ -144,7 +147,7 @@ class Announcements:
                 self._logger.info(f"first torque: {sum(controller.command.motor_torque_nm):.1f} N m over all wheels")
             self._lost_wheels(controller, wheel_names)
         self._was_degraded |= mode == MODE_DEGRADED
-        self._mode, self._stale = mode, stale
+        self._mode = mode
 
     def late(self, stale: int, ages_s: Sequence[float]) -> None:
         """Remember how old the inputs were in a step that missed some of them."""
@@ -156,7 +159,9 @@ class Announcements:
         """What there is to say of inputs that are back already."""
         missed = self._values.get("missed_periods")
         return ", ".join(
-            f"{name} was {age_s:.3f} s old (input_period_s {self._values[f'input_period_s.{name}']:g}, "
+            f"{name} had not come yet"
+            if math.isinf(age_s)
+            else f"{name} was {age_s:.3f} s old (input_period_s {self._values[f'input_period_s.{name}']:g}, "
             f"missed_periods {missed})"
             for name, age_s in self._late_s.items()
         )

@@ -380,6 +380,8 @@ class PowerManager(Starting):
             standing_s = time.monotonic() - self._last_step_steady_s
             if stepping and standing_s > self._values["clock_stopped_s"]:
                 stepping = False
+                if not self._fault:
+                    self.get_logger().warning("the clock stands still: zero torque")
                 self._fault = "the clock stands still"
                 self._start_over()
                 assert self._outputs is not None

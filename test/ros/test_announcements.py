@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from iwm_power_manager.control.monitor import Tally
-from iwm_power_manager.control.supervision import MODE_DEGRADED, STALE_NAMES, STALE_SPEED, Supervision
+from iwm_power_manager.control.supervision import MODE_DEGRADED, STALE_BATTERY, STALE_NAMES, STALE_SPEED, Supervision
 from iwm_power_manager.nodes.announcements import Announcements
 
 VALUES = {"missed_periods": 3, **{f"input_period_s.{name}": 0.01 for name in STALE_NAMES.values()}}
@@ -44,7 +45,7 @@ def prepared(elapsed_s: float, compiled: int) -> Any:
 def test_an_input_that_is_back_already_is_named_with_its_age_and_its_limit(log: Log) -> None:
     says = Announcements(log)
     says.prepared(prepared(1.0, 0))
-    says.late(STALE_SPEED, (0.052, 0.01, 0.01, 0.1))
+    says.late(STALE_SPEED | STALE_BATTERY, (0.052, 0.01, 0.01, math.inf))
     controller: Any = SimpleNamespace(
         supervision=Supervision(mode=MODE_DEGRADED),
         monitor=SimpleNamespace(tallies={name: Tally() for name in STALE_NAMES.values()}),
@@ -52,8 +53,25 @@ def test_an_input_that_is_back_already_is_named_with_its_age_and_its_limit(log: 
     )
     says.stepped(controller, {}, {}, (), 0)
     assert log.lines[-1] == (
-        "degraded, motor torque fades: vehicle_speed was 0.052 s old (input_period_s 0.01, missed_periods 3)"
+        "degraded, motor torque fades: vehicle_speed was 0.052 s old (input_period_s 0.01, missed_periods 3), "
+        "battery_state had not come yet"
     )
+
+
+def test_inputs_that_come_and_go_while_it_is_degraded_do_not_fill_the_log(log: Log) -> None:
+    says = Announcements(log)
+    says.prepared(prepared(1.0, 0))
+    before = len(log.lines)
+    tallies = {name: Tally() for name in STALE_NAMES.values()}
+    for i in range(100):
+        controller: Any = SimpleNamespace(
+            supervision=Supervision(mode=MODE_DEGRADED, stale=(STALE_SPEED, STALE_BATTERY)[i % 2]),
+            monitor=SimpleNamespace(tallies=tallies),
+            command=None,
+        )
+        says.stepped(controller, {}, {}, (), 0)
+    names = ("vehicle_speed", "battery_state")
+    assert log.lines[before:] == [f"degraded, motor torque fades: {name}" for name in names]
 
 
 @pytest.mark.parametrize(("compiled", "words"), [(0, "no kernels compiled"), (7, "7 kernels compiled")])

@@ -141,6 +141,7 @@ def test_what_dds_held_back_is_not_heard_by_who_asks_for_a_lifespan(start_pair) 
 
 
 @pytest.mark.nightly
+@pytest.mark.timeout(3600)
 def test_two_hundred_stops(start_pair) -> None:
     """Prints what docs/safety.md says; `-s` shows it."""
     found = run(start_pair, 200, int(os.environ.get("HELD_UP_SEED", "1")))

@@ -8,6 +8,8 @@ import random
 from pathlib import Path
 
 import pytest
+from rcl_interfaces.msg import Log
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
@@ -166,9 +168,13 @@ class TestSimulatedTime:
         assert len(stamps) >= 3
 
     def test_a_clock_that_stands_still_commands_zero_torque(self, bench) -> None:
+        said: list[str] = []
+        late_too = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        bench.node.create_subscription(Log, "/rosout", lambda message: said.append(message.msg), late_too)
         bench.drive(lambda: bench.last("front_left_motor_torque_nm") > 30.0, "torque")
         bench.spin_until(lambda: list(bench.torques[-1].effort) == [0.0] * 4, "zero torque")
         bench.spin_until(lambda: bench.status("fault"), "the reason")
+        bench.spin_until(lambda: "the clock stands still: zero torque" in said, "the reason in the log")
         assert "clock stands still" in bench.status("fault").message
         bench.drive(lambda: bench.mode() == 1, "recovery")
         bench.diagnostics.clear()
