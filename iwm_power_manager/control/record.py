@@ -7,12 +7,13 @@ measurement and settings to the law again, starting from the initial state where
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, get_type_hints
 
 from iwm_power_manager.control.settings import DEFAULTS, Settings
+from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_power_manager.control.supervision import Supervision
-from iwm_power_manager.control.types import WHEEL_NAMES, Command, ControllerState, Measurement, Wheels
+from iwm_power_manager.control.types import WHEEL_NAMES, Command, ControllerState, Measurement
 
 _SETTING = "setting."
 
@@ -81,12 +82,13 @@ _SUPERVISION = (
     Signal("power_demand_age_s", "age of the power demand"),
     Signal("battery_state_age_s", "age of the battery's state"),
 )
-_SETTING_TYPES = {name: type(value) for name, value in DEFAULTS._asdict().items()}
+_SETTING_TYPES = tuple(map(type, DEFAULTS))
 _SETTINGS = tuple(Signal(_SETTING + name, "the law's setting of that name") for name in Settings._fields)
 
 #: All signals, in the order in which they are published.
 SIGNALS = (*_MEASUREMENT, *_COMMAND, *_CONTROLLER, *_SUPERVISION, *_SETTINGS)
 SIGNAL_NAMES = [signal.name for signal in SIGNALS]
+_STEP = SIGNAL_NAMES.index("step")
 
 
 class Watch(NamedTuple):
@@ -138,22 +140,97 @@ YOUNGER_SIGNALS = (
     | {f"{side}_friction": 0.0 for side in ("left", "right")}
     | {f"{side}_friction_confidence": 0.0 for side in ("left", "right")}
 )
+_YOUNGER = YOUNGER_SIGNALS | {_SETTING + name: float(value) for name, value in DEFAULTS._asdict().items()}
 
 #: The signals the law decides.
 DECIDED_NAMES = tuple(signal.name for signal in (*_COMMAND, *_CONTROLLER))
+#: Where they stand among `SIGNALS`, and where the settings do.
+DECIDED = slice(len(_MEASUREMENT), len(_MEASUREMENT) + len(DECIDED_NAMES))
+SETTINGS = slice(len(SIGNALS) - len(_SETTINGS), len(SIGNALS))
+_COMMAND_TYPES = tuple(get_type_hints(Command).values())[2:]
+#: No number of a record that counts something is larger: beyond, a double has no integers.
+_LARGEST_COUNT = 2.0**53
 
 
-def decided(command: Command, before: ControllerState, after: ControllerState) -> list[float]:
+def decided(command: Command, before: ControllerState, after: ControllerState) -> tuple[float, ...]:
     """Values of `DECIDED_NAMES`."""
-    heat = [wheel.heat for wheel in after.wheels]
-    return [
-        *command.motor_torque_nm,
-        *command.friction_torque_nm,
-        *command[2:],
-        before.steps,
-        max(heat[:2]),
-        max(heat[2:]),
-    ]
+    motor, friction = command.motor_torque_nm, command.friction_torque_nm
+    front_left, front_right, rear_left, rear_right = after.wheels
+    return (
+        motor[0],
+        motor[1],
+        motor[2],
+        motor[3],
+        friction[0],
+        friction[1],
+        friction[2],
+        friction[3],
+        command.front_share,
+        command.decided_share,
+        float(command.gate),
+        float(command.limits),
+        command.front_power_w,
+        command.rear_power_w,
+        command.front_slip,
+        command.rear_slip,
+        float(command.gated_wheels),
+        command.speed_mps,
+        float(command.doubted),
+        command.hold_nm,
+        command.left_friction,
+        command.right_friction,
+        command.left_confidence,
+        command.right_confidence,
+        float(before.steps),
+        max(front_left.heat, front_right.heat),
+        max(rear_left.heat, rear_right.heat),
+    )
+
+
+def command_of(numbers: Sequence[float]) -> Command:
+    """The command among values of `DECIDED_NAMES`."""
+    a, b, c, d, e, f, g, h, *others = numbers[: len(_COMMAND)]
+    rest: list[Any] = [kind(value) for kind, value in zip(_COMMAND_TYPES, others, strict=True)]
+    return Command((a, b, c, d), (e, f, g, h), *rest)
+
+
+def measurement_of(numbers: Sequence[float]) -> Measurement:
+    """The measurement among values of `SIGNALS`."""
+    n = numbers
+    return Measurement(
+        speed_mps=n[0],
+        wheel_speed_radps=(n[1], n[2], n[3], n[4]),
+        power_demand_w=n[5],
+        dt_s=n[6],
+        friction=n[7],
+        discharge_limit_w=n[8],
+        charge_limit_w=n[9],
+        soc=n[10],
+        motor_gain=(n[11], n[12], n[13], n[14]),
+        direction=n[15],
+        motor_stuck_nm=(n[16], n[17], n[18], n[19]),
+    )
+
+
+def completed(names: Sequence[str], values: Sequence[float]) -> Sequence[float]:
+    """A record's values in the order of `SIGNALS`; a signal or a setting that is younger than it has its default.
+
+    Raises
+    ------
+    KeyError
+        A signal is missing: the record was not made by this project, or by another version of it.
+    ValueError
+        There are more names than values, or fewer.
+    """
+    if list(names) == SIGNAL_NAMES:
+        return values
+    known = _YOUNGER | dict(zip(names, values, strict=True))
+    return [known[name] for name in SIGNAL_NAMES]
+
+
+def step_of(numbers: Sequence[float]) -> int:
+    """Steps of the run before this one; `ValueError` if that is no number of steps."""
+    return int(_typed(int, numbers[_STEP]))
 
 
 class RecordedStep(NamedTuple):
@@ -164,36 +241,22 @@ class RecordedStep(NamedTuple):
     settings: Settings
 
 
-def from_numbers(values: Mapping[str, float]) -> RecordedStep:
+def from_numbers(numbers: Sequence[float]) -> RecordedStep:
     """The inverse of `to_numbers`, as far as the law's inputs go.
 
     Raises
     ------
-    KeyError
-        A signal is missing: the record was not made by this project, or by another version of it.
+    ValueError
+        What counts something, or chooses, is no such number.
     """
-    known = YOUNGER_SIGNALS | dict(values)
-
-    def wheels(signal: str) -> Wheels:
-        fl, fr, rl, rr = (float(known[f"{wheel}_{signal}"]) for wheel in WHEEL_NAMES)
-        return (fl, fr, rl, rr)
-
-    measurement = Measurement(
-        speed_mps=float(known["speed_mps"]),
-        wheel_speed_radps=wheels("speed_radps"),
-        power_demand_w=float(known["power_demand_w"]),
-        dt_s=float(known["dt_s"]),
-        friction=float(known["friction"]),
-        discharge_limit_w=float(known["discharge_limit_w"]),
-        charge_limit_w=float(known["charge_limit_w"]),
-        soc=float(known["soc"]),
-        motor_gain=wheels("motor_gain"),
-        direction=float(known["direction"]),
-        motor_stuck_nm=wheels("motor_stuck_nm"),
-    )
     # Integers and flags travel as numbers; the law has to get back the types it was compiled for.
-    # A setting that is younger than the record has its default.
-    settings = DEFAULTS._replace(
-        **{name: kind(values[_SETTING + name]) for name, kind in _SETTING_TYPES.items() if _SETTING + name in values}
-    )
-    return RecordedStep(values["step"] == 0.0, measurement, settings)
+    settings = Settings(*(_typed(kind, value) for kind, value in zip(_SETTING_TYPES, numbers[SETTINGS], strict=True)))
+    if all(strategy.code != settings.strategy for strategy in STRATEGIES.values()):
+        raise ValueError(f"strategy {settings.strategy} does not exist")
+    return RecordedStep(numbers[_STEP] == 0.0, measurement_of(numbers), settings)
+
+
+def _typed(kind: type[Any], value: float) -> Any:
+    if kind is not float and not 0.0 <= value < _LARGEST_COUNT:  # written so that NaN is refused
+        raise ValueError(f"{value} counts nothing")
+    return kind(value)

@@ -9,13 +9,13 @@ steps are made from the mapped input signals.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.writer import BagWriter
-from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS
+from iwm_power_manager.control.record import DECIDED, DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.replay.commands import RecordedCommand, command_topics, commands_elsewhere, torques_nm
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
@@ -27,7 +27,7 @@ from iwm_power_manager.signals.commands import CommandWriter
 from iwm_power_manager.signals.contract import NODE_FRICTION
 from iwm_power_manager.signals.contract import POWER_MANAGER_STATE as STATE
 from iwm_power_manager.signals.mapping import JOINT_STATE, SignalMapping, topic_named
-from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
+from iwm_power_manager.signals.readings import NamedValues, joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import definition_of
 
 #: How the state's topic ends, whatever its node is called.
@@ -42,7 +42,9 @@ _FEW_STEPS = 0.1
 #: How many topics are named that may be a command under another name, and what to do with one.
 _CANDIDATES = 5
 _RENAME = "if it is one of them: --mapping with a copy of that file that has the recorded name"
-_FIRST_DECIDED = SIGNAL_NAMES.index(DECIDED_NAMES[0])
+#: A replay takes so many messages, or bytes, at a time.
+_BATCH_MESSAGES = 2000
+_BATCH_BYTES = 16 * 1024 * 1024
 
 
 class ReplayReport(NamedTuple):
@@ -57,7 +59,7 @@ class ReplayReport(NamedTuple):
     first_stamp_ns, last_stamp_ns : of the steps
     span_ns : driven: from each step to the next, jumps back left out
     gaps : times at which steps are missing in the record, so that the law's memory is unknown
-    late_start : the recording began in the middle of a run, so that nobody knows the law's memory
+    changed : steps whose torques are not the recorded ones, whatever the law remembers at a gap
     restarts : pauses in the inputs after which the law started anew
     bad_messages : messages that could not be decoded
     dropped : inputs that were not believed, by topic and reason
@@ -75,7 +77,7 @@ class ReplayReport(NamedTuple):
     last_stamp_ns: int
     span_ns: int
     gaps: int
-    late_start: bool
+    changed: int
     restarts: int
     bad_messages: int
     dropped: dict[str, dict[str, int]]
@@ -119,7 +121,7 @@ class Replay:
         self._not_compared: list[str] = []
         self._find_commands(plan.mapping, tolerance)
         if self._state_topic is not None:
-            self._recorded = RecordedSteps(plan)
+            self._recorded = RecordedSteps(plan, tolerance)
         else:
             self._stream = SignalStream(bag, plan.mapping, plan.vehicle.params)
             check_signals(bag, plan.mapping, self._stream, wheels=True)
@@ -139,18 +141,20 @@ class Replay:
 
         `progress(messages, log_time_ns)` is called now and then.
         """
-        for message in self._bag.messages():
-            self._messages += 1
-            if progress is not None and self._messages % PROGRESS_EVERY == 0:
-                progress(self._messages, message.log_time_ns)
-            steps = self._take(message)
-            for step in steps:
-                first_ns, last_ns = self._stamps if self._steps else (step.stamp_ns, step.stamp_ns)
-                self._span_ns += max(step.stamp_ns - last_ns, 0)
-                self._stamps = (first_ns, step.stamp_ns)
-                self._steps += 1
-                self._compare(step)
-            yield message, steps
+        for batch in _batches(self._bag.messages()):
+            repeated = self._repeated(batch)
+            for message in batch:
+                self._messages += 1
+                if progress is not None and self._messages % PROGRESS_EVERY == 0:
+                    progress(self._messages, message.log_time_ns)
+                steps = self._take(message) if message.topic != self._state_topic else next(repeated)
+                for step in steps:
+                    first_ns, last_ns = self._stamps if self._steps else (step.stamp_ns, step.stamp_ns)
+                    self._span_ns += max(step.stamp_ns - last_ns, 0)
+                    self._stamps = (first_ns, step.stamp_ns)
+                    self._steps += 1
+                    self._compare(step)
+                yield message, steps
 
     def report(self) -> ReplayReport:
         """What has been done so far."""
@@ -164,7 +168,7 @@ class Replay:
             *self._stamps,
             self._span_ns,
             self._recorded.gaps if self._recorded else 0,
-            self._recorded is not None and self._recorded.late_start,
+            self._recorded.changed if self._recorded else 0,
             self._reconstructed.restarts if self._reconstructed else 0,
             self._bad_messages + (self._stream.bad_messages if self._stream else 0),
             self._reconstructed.dropped if self._reconstructed else {},
@@ -205,8 +209,6 @@ class Replay:
         return [f"only {self._steps} steps of {wheels} messages: {self.why_no_step()}"]
 
     def _take(self, message: Message) -> list[ReplayedStep]:
-        if message.topic == self._state_topic:
-            return self._take_state(message)
         command = self._commands.get(message.topic)
         if command is not None:
             try:
@@ -241,33 +243,52 @@ class Replay:
             elif not sinks:
                 self._not_compared.append(f"{kind}: goes nowhere ({mapping.path})")
 
-    def _take_state(self, message: Message) -> list[ReplayedStep]:
-        """A recorded state: what the recomputed one is held against, and a step."""
+    def _repeated(self, batch: Sequence[Message]) -> Iterator[list[ReplayedStep]]:
+        """The step of each recorded state of a batch, as the state's turn comes; none for one that cannot be read."""
+        if self._recorded is None:
+            return iter(())
+        states = [
+            (message.log_time_ns, self._taken(message)) for message in batch if message.topic == self._state_topic
+        ]
+        steps = iter(self._recorded.repeated())
+        return (self._held_against(*state, steps) for state in states)
+
+    def _taken(self, message: Message) -> NamedValues | None:
+        """Take a recorded state; None, and it counts as bad, if it is none."""
         assert self._recorded is not None
         try:
             recorded = _STATE_READER(message.data)
-            step = self._recorded.take(recorded, message.log_time_ns, message.publish_time_ns)
+            self._recorded.take(recorded, message.log_time_ns, message.publish_time_ns)
         except KeyError as error:
             raise BagError(
                 f"{self._bag.path}: {message.topic} lacks the signal {error}: recorded by another version"
             ) from None
         except (UnreadableError, ValueError):
             self._bad_messages += 1
+            return None
+        return recorded
+
+    def _held_against(
+        self, log_time_ns: int, recorded: NamedValues | None, steps: Iterator[ReplayedStep | None]
+    ) -> list[ReplayedStep]:
+        """What a recorded state says, for the comparison, and its step."""
+        if recorded is None:
             return []
         names, values = recorded.names, recorded.values
         if list(names) == SIGNAL_NAMES:
-            names, values = DECIDED_NAMES, values[_FIRST_DECIDED : _FIRST_DECIDED + len(DECIDED_NAMES)]
+            names, values = DECIDED_NAMES, values[DECIDED]
         else:
             found = dict(zip(names, values, strict=True))
             names = tuple(name for name in DECIDED_NAMES if name in found)
             values = tuple(found[name] for name in names)
-        self._state_comparer.recorded(recorded.stamp_ns, message.log_time_ns, names, values)
+        self._state_comparer.recorded(recorded.stamp_ns, log_time_ns, names, values)
+        step = next(steps)
         return [step] if step is not None else []
 
     def _compare(self, step: ReplayedStep) -> None:
         for command in self._commands.values():
             command.recomputed(step)
-        self._state_comparer.recomputed(step.stamp_ns, step.log_time_ns, DECIDED_NAMES, decided_values(step))
+        self._state_comparer.recomputed(step.stamp_ns, step.log_time_ns, DECIDED_NAMES, tuple(step.values[DECIDED]))
 
 
 class ReplayOutput:
@@ -325,9 +346,17 @@ def exceeds(comparison: Sequence[TopicComparison], tolerance: float) -> bool:
     return not any(topic.compared for topic in comparison) or any(topic.largest > tolerance for topic in comparison)
 
 
-def decided_values(step: ReplayedStep) -> tuple[float, ...]:
-    """Of a step's numbers, those the law decided."""
-    return tuple(step.values[_FIRST_DECIDED : _FIRST_DECIDED + len(DECIDED_NAMES)])
+def _batches(messages: Iterable[Message]) -> Iterator[list[Message]]:
+    """Messages in batches, which take little memory even where messages are large."""
+    batch: list[Message] = []
+    size = 0
+    for message in messages:
+        batch.append(message)
+        size += len(message.data)
+        if len(batch) == _BATCH_MESSAGES or size > _BATCH_BYTES:
+            yield batch
+            batch, size = [], 0
+    yield batch
 
 
 def state_topic(bag: BagReader) -> str | None:

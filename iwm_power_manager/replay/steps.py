@@ -5,10 +5,14 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-from iwm_power_manager.control import law, lockstep
+import numpy as np
+from numpy.typing import NDArray
+
+from iwm_power_manager.control import lockstep
+from iwm_power_manager.control.budget import BUCKET_MIN
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.monitor import (
@@ -21,11 +25,24 @@ from iwm_power_manager.control.monitor import (
     JointReading,
     SpeedReading,
 )
-from iwm_power_manager.control.record import DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS, decided, from_numbers
+from iwm_power_manager.control.persistence import SAMPLE_S
+from iwm_power_manager.control.record import (
+    DECIDED,
+    DECIDED_NAMES,
+    SETTINGS,
+    SIGNAL_NAMES,
+    command_of,
+    completed,
+    from_numbers,
+    measurement_of,
+    step_of,
+)
+from iwm_power_manager.control.repeat import repeat
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.stepping import AsRecorded, Lockstep, Taken
+from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.thresholds import RECORDED, actuator_limits, input_limits, supervision_limits
-from iwm_power_manager.control.types import Command, ControllerState, initial_state
+from iwm_power_manager.control.types import Command, ControllerState, SideGrip, WheelState, initial_state
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import Recorded
 from iwm_power_manager.signals.contract import WHEEL_NAMES
@@ -39,6 +56,22 @@ _TOPICS = {
     DemandReading: DEMAND,
     FrictionReading: FRICTION,
 }
+#: Where these stand among a record's numbers, and torques and heat indices among those the law decides.
+_FRICTION, _DT = SIGNAL_NAMES.index("friction"), SIGNAL_NAMES.index("dt_s")
+_TORQUES, _HEAT = slice(0, 8), DECIDED_NAMES.index("front_heat")
+#: Memories that have given the same numbers, to within this, for so long, s, do not matter any more; a torque that is
+#: further from theirs, N m, has another reason.
+_ALIKE = 1e-6
+_SETTLED_S = 2.0
+_UNLIKE_NM = 1e-3
+#: A restless drive: how far its demand jumps, W, and how little of a jump lasts.
+_RESTLESS_W = 3000.0
+_LASTING = 0.1
+#: The same for what a slope, or the car's load, does to it, m/s2, and for how long torques have been unequal.
+_SLOPE_MPS2 = 3.0
+_LONG_S = 10.0
+FloatArray = NDArray[np.float64]
+
 #: A pause in the recording longer than this starts the law anew.
 _PAUSE_S = 1.0
 #: Values from the start of a bag that show whether its messages come in sets of one stamp.
@@ -53,7 +86,6 @@ class ReplayedStep(NamedTuple):
     stamp_ns : of the command
     log_time_ns, publish_time_ns : of the message that caused the step
     command : what it decided
-    before, after : its memory
     values : numbers of `control.record.SIGNALS`
     """
 
@@ -61,76 +93,186 @@ class ReplayedStep(NamedTuple):
     log_time_ns: int
     publish_time_ns: int
     command: Command
-    before: ControllerState
-    after: ControllerState
     values: Sequence[float]
+
+
+class _Due(NamedTuple):
+    """A recorded step that waits to be repeated; without numbers it is the answer before, sent again."""
+
+    stamp_ns: int
+    log_time_ns: int
+    publish_time_ns: int
+    numbers: Sequence[float]
+
+
+class _Block(NamedTuple):
+    """Recorded steps one after the other, with the same settings and policy.
+
+    Attributes
+    ----------
+    begins : number of its first step, where that is not the one after the step before
+    """
+
+    settings: Settings
+    table: PolicyTable
+    begins: int | None
+    due: list[_Due]
 
 
 class RecordedSteps:
     """Repeats the steps a `power_manager/state` has recorded, bit by bit as long as none is missing.
 
+    They are taken many at a time: the law's memory takes longer on its way in and out of compiled code than a step.
+
     Attributes
     ----------
     gaps : times at which the law's memory is unknown, because steps before are not in the bag
-    late_start : the first recorded step is not the first of its run
+    changed : steps whose torques are not the recorded ones, whatever the law remembers at a gap
     faults : steps whose command no motor may be given; they come without a command
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, tolerance: float = 0.0) -> None:
         self.gaps = 0
-        self.late_start = False
+        self.changed = 0
         self.faults: Counter[str] = Counter()
         self._plan = plan
-        self._state = initial_state()
+        self._tolerance = tolerance
+        self._memories = [initial_state()]  # of which the first counts
+        self._recorded: Sequence[float] = ()  # settings
+        self._settings = plan.settings
+        self._blocks: list[_Block] = []
         self._next = 0
-        self._last: ReplayedStep | None = None
-        self._settings: Settings | None = None
-        self._setting_values: dict[str, float] = {}
+        self._stamp_ns = -1
+        self._made: ReplayedStep | None = None
+        self._alike_s = 0.0  # for how long all memories have given the same
 
-    def take(self, recorded: NamedValues, log_time_ns: int, publish_time_ns: int) -> ReplayedStep | None:
-        """Repeat one step; `KeyError` if the message is of another kind or version."""
-        values = YOUNGER_SIGNALS | dict(zip(recorded.names, recorded.values, strict=True))
-        number = int(values["step"])
-        last = self._last
-        if last is not None and last.stamp_ns == recorded.stamp_ns and last.before.steps == number:
-            return last._replace(log_time_ns=log_time_ns, publish_time_ns=publish_time_ns)  # an answer, repeated
-        first, measurement, settings = from_numbers(values)
-        if first:
-            self._state = initial_state()
-        elif number != self._next:
-            self.gaps += 1
-            self.late_start |= self._last is None
-            self._state = self._state._replace(steps=number)
-        self._next = number + 1
+    def take(self, recorded: NamedValues, log_time_ns: int, publish_time_ns: int) -> None:
+        """Take one step; `KeyError` or `ValueError` if the message is of another kind or version."""
         plan = self._plan
-        if plan.changes:
-            settings = settings._replace(**plan.changes)
-        if not plan.keeps_friction:
-            measurement = measurement._replace(friction=plan.friction)
-        table = plan.policies.table(settings.strategy, measurement.friction)
-        before = self._state
-        command, after = law.step(measurement, before, settings, plan.vehicle.params, table)
-        self._state = after
-        problem = violated_bound(command, plan.vehicle.params)
-        if problem:
-            self.faults[problem] += 1
-            return None
-        values.update(zip(DECIDED_NAMES, map(float, decided(command, before, after)), strict=True))
-        if settings != self._settings:  # they rarely change
-            self._settings = settings
-            self._setting_values = {f"setting.{name}": float(value) for name, value in settings._asdict().items()}
-        values.update(self._setting_values)
-        values["friction"] = measurement.friction
-        self._last = ReplayedStep(
-            recorded.stamp_ns,
-            log_time_ns,
-            publish_time_ns,
-            command,
-            before,
-            after,
-            [values[name] for name in SIGNAL_NAMES],
-        )
-        return self._last
+        numbers = completed(recorded.names, recorded.values)
+        number = step_of(numbers)
+        if number + 1 == self._next and recorded.stamp_ns == self._stamp_ns:
+            self._blocks[-1].due.append(_Due(recorded.stamp_ns, log_time_ns, publish_time_ns, ()))
+            return
+        if numbers[SETTINGS] != self._recorded:  # they rarely change
+            self._settings = from_numbers(numbers).settings._replace(**plan.changes)
+            self._recorded = numbers[SETTINGS]
+        friction = measurement_of(numbers).friction if plan.keeps_friction else plan.friction
+        table = plan.policies.table(self._settings.strategy, friction)
+        begins = number if number == 0 or number != self._next else None
+        last = self._blocks[-1] if self._blocks else None
+        if begins is not None or last is None or last.settings is not self._settings or last.table is not table:
+            self._blocks.append(_Block(self._settings, table, begins, []))
+        self._blocks[-1].due.append(_Due(recorded.stamp_ns, log_time_ns, publish_time_ns, numbers))
+        self.gaps += bool(begins)
+        self._next, self._stamp_ns = number + 1, recorded.stamp_ns
+
+    def repeated(self) -> list[ReplayedStep | None]:
+        """One step for each that was taken since the last call; None for one without a command."""
+        made = [step for block in self._blocks for step in self._repeated(block)]
+        self._blocks = [block._replace(begins=None, due=[]) for block in self._blocks[-1:]]
+        return made
+
+    def _repeated(self, block: _Block) -> Iterator[ReplayedStep | None]:
+        rows = iter(self._computed(block, [due.numbers for due in block.due if due.numbers]))
+        for due in block.due:
+            if due.numbers:
+                row = next(rows)
+                command = command_of(row[DECIDED])
+                problem = violated_bound(command, self._plan.vehicle.params)
+                self.faults.update([problem] if problem else [])
+                self._made = None if problem else ReplayedStep(*due[:3], command, row)
+            yield self._made and self._made._replace(log_time_ns=due.log_time_ns, publish_time_ns=due.publish_time_ns)
+
+    def _computed(self, block: _Block, recorded: list[Sequence[float]]) -> list[list[float]]:
+        """Numbers of steps, with what the law decides today."""
+        if not recorded:
+            return []
+        if block.begins is not None:
+            self._memories = possible_memories(self._memories[0], block.begins, recorded[0], block.table)
+            self._alike_s = 0.0
+        numbers = np.array(recorded)
+        numbers[:, SETTINGS] = block.settings
+        if not self._plan.keeps_friction:
+            numbers[:, _FRICTION] = self._plan.friction
+        results = np.empty((len(self._memories), len(recorded), len(DECIDED_NAMES)))
+        self._memories = [
+            repeat(numbers, memory, block.settings, self._plan.vehicle.params, block.table, result)
+            for memory, result in zip(self._memories, results, strict=True)
+        ]
+        self.changed += self._changed(numbers, results)
+        if all(memory == self._memories[0] for memory in self._memories):
+            del self._memories[1:]
+        numbers[:, DECIDED] = results[0]
+        return numbers.tolist()
+
+    def _changed(self, numbers: FloatArray, results: FloatArray) -> int:
+        """How many steps no memory explains: all have given the same for a while, and the record is another."""
+        apart_nm = np.abs(numbers[:, DECIDED] - results[0])[:, _TORQUES].max(axis=1)
+        if len(results) == 1:
+            return int(np.count_nonzero(~(apart_nm <= self._tolerance)))
+        changed = 0
+        alike = np.ptp(results[:, :, :_HEAT], axis=0).max(axis=1) <= _ALIKE
+        for one, apart, dt_s in zip(alike.tolist(), apart_nm.tolist(), numbers[:, _DT].tolist(), strict=True):
+            self._alike_s = self._alike_s + dt_s if one else 0.0
+            changed += self._alike_s > _SETTLED_S and not apart <= self._tolerance + _UNLIKE_NM
+        return changed
+
+
+def possible_memories(
+    before: ControllerState, step: int, recorded: Sequence[float], table: PolicyTable
+) -> list[ControllerState]:
+    """What the law may remember at a step: all it does at the first of a run; what it may where steps are missing.
+
+    The first is what a replay goes on with: the memory before the gap, or what the record shows of it. The others are
+    extremes of what it does not show: uphill, and downhill with a restless demand and all changes of the split used up.
+    """
+    new = initial_state()
+    if step == 0:
+        return [new]
+    m, command = measurement_of(recorded), command_of(recorded[DECIDED])
+    heats = recorded[DECIDED][_HEAT:]
+    travel = -1.0 if m.speed_mps < 0.0 else 1.0
+
+    def wheel(i: int) -> WheelState:
+        torque_nm = travel * (command.motor_torque_nm[i] + command.friction_torque_nm[i])
+        slip = command.front_slip if i < 2 else command.rear_slip
+        gated = bool(command.gated_wheels >> i & 1)
+        motor_nm, speed_radps = travel * command.motor_torque_nm[i], travel * m.wheel_speed_radps[i]
+        return WheelState(motor_nm, torque_nm, speed_radps, torque_nm, slip, gated, heats[i // 2])
+
+    shown = new._replace(
+        wheels=(wheel(0), wheel(1), wheel(2), wheel(3)),
+        split=new.split._replace(
+            decisions=step, age_s=m.dt_s, decided_share=command.decided_share, applied_share=command.front_share
+        ),
+        motion=new.motion._replace(speed_mps=command.speed_mps, shown_mps=m.speed_mps),
+        travel=travel,
+        hold_nm=command.hold_nm,
+        friction=new.friction._replace(
+            left=SideGrip(command.left_friction, command.left_confidence),
+            right=SideGrip(command.right_friction, command.right_confidence),
+            assumed=m.friction,
+        ),
+    )
+    uphill = shown._replace(motion=shown.motion._replace(bias_mps2=-_SLOPE_MPS2))
+    demand_w2 = m.power_demand_w**2 + _RESTLESS_W**2
+    jitter = shown.split.jitter._replace(
+        age_s=0.5 * SAMPLE_S, taken=step, variance_w2=demand_w2, covariance_w2=-0.4 * demand_w2, gain=_LASTING
+    )
+    downhill = shown._replace(
+        split=shown.split._replace(
+            age_s=0.0,
+            changes_used=BUCKET_MIN * table.changes_per_min,
+            decided_share=1.0 - command.decided_share,
+            jitter=jitter,
+        ),
+        front_unequal_s=_LONG_S,
+        rear_unequal_s=_LONG_S,
+        motion=shown.motion._replace(bias_mps2=_SLOPE_MPS2),
+    )
+    first = before if before.steps else shown
+    return [memory._replace(steps=step) for memory in (first, uphill, downhill)]
 
 
 class ReconstructedSteps:
@@ -198,12 +340,7 @@ class ReconstructedSteps:
         else:
             kind = {SPEED: lockstep.SPEED, WHEELS: lockstep.WHEELS, BATTERY: lockstep.BATTERY}[topic]
             queue.push(kind, now_ns, value.publish_time_ns, content)
-        before = self._controller.state
-        steps = []
-        for taken in self._lockstep.steps():
-            steps += self._replayed(taken, before, value)
-            before = self._controller.state
-        return steps
+        return [step for taken in self._lockstep.steps() for step in self._replayed(taken, value)]
 
     def _use(self, topic: str, content: object, now_ns: int, value: Recorded) -> list[ReplayedStep]:
         """Not in sets: keep the latest of everything, step at the wheel speeds."""
@@ -217,9 +354,8 @@ class ReconstructedSteps:
         elif topic == FRICTION:
             self._friction(content, now_ns)
         else:
-            before = self._controller.state
             taken = self._recorded.step(content, now_ns)
-            return self._replayed(taken, before, value) if taken is not None else []
+            return self._replayed(taken, value) if taken is not None else []
         return []
 
     def _friction(self, content: object, now_ns: int) -> None:
@@ -228,23 +364,12 @@ class ReconstructedSteps:
             controller.friction = controller.monitor.friction
             controller.policy = self._plan.policies.table(self._plan.settings.strategy, controller.friction)
 
-    def _replayed(self, taken: Taken, before: ControllerState, value: Recorded) -> list[ReplayedStep]:
+    def _replayed(self, taken: Taken, value: Recorded) -> list[ReplayedStep]:
         if taken.fault:
             self.faults[taken.fault] += 1
         if taken.step is None:
             return []  # a fault, or the same set once more
-        command, numbers = taken.step
-        return [
-            ReplayedStep(
-                taken.stamp_ns,
-                value.log_time_ns,
-                value.publish_time_ns,
-                command,
-                before if taken.since_s is not None else initial_state(),
-                self._controller.state,
-                numbers,
-            )
-        ]
+        return [ReplayedStep(taken.stamp_ns, value.log_time_ns, value.publish_time_ns, *taken.step)]
 
 
 def _in_sets(probe: Iterable[Recorded]) -> bool:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 from iwm_power_manager.bags.reader import BagReader
-from iwm_power_manager.control.record import SIGNAL_NAMES, from_numbers
+from iwm_power_manager.control.record import DECIDED, command_of, completed, measurement_of
 from iwm_power_manager.control.types import Measurement, Wheels
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.model.battery import chemical_power_w
@@ -22,6 +22,7 @@ from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, rege
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.run import Replay, state_topic
+from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.signals.readings import joint_state_reader
 
@@ -132,7 +133,7 @@ def what_if(
         first = not results
         for _, steps in replay.steps(progress):
             for done in steps:
-                measurement = from_numbers(dict(zip(SIGNAL_NAMES, done.values, strict=True))).measurement
+                measurement = measurement_of(done.values)
                 torques, brakes = done.command.motor_torque_nm, done.command.friction_torque_nm
                 if first:
                     forces_n[done.stamp_ns] = force_n(vehicle, measurement, torques, brakes)
@@ -156,12 +157,11 @@ def _recorded_steps(bag: BagReader, state: str) -> Iterator[tuple[int, tuple[Mea
         if message.topic == state:
             try:
                 recorded = decode(message.data)
-                values = dict(zip(recorded.names, recorded.values, strict=True))
-                measurement = from_numbers(values).measurement
-                motors, brakes = _wheels(values, "motor_torque_nm"), _wheels(values, "friction_torque_nm")
-            except Exception:  # noqa: BLE001, S112 - the replay counts what cannot be decoded
-                continue
-            yield recorded.stamp_ns, (measurement, motors, brakes)
+                values = completed(recorded.names, recorded.values)
+                command = command_of(values[DECIDED])
+            except (UnreadableError, KeyError, ValueError, OverflowError):
+                continue  # the replay counts it
+            yield recorded.stamp_ns, (measurement_of(values), command.motor_torque_nm, command.friction_torque_nm)
 
 
 def force_n(vehicle: VehicleParams, measurement: Measurement, motor_nm: Wheels, brake_nm: Wheels) -> float:
@@ -197,8 +197,3 @@ def at_force(
 
 def _axle(vehicle: VehicleParams, wheel: int) -> Axle:
     return vehicle.front if wheel < 2 else vehicle.rear
-
-
-def _wheels(values: dict[str, float], kind: str) -> Wheels:
-    a, b, c, d = (values[f"{wheel}_{kind}"] for wheel in WHEEL_NAMES)
-    return a, b, c, d

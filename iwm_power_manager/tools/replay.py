@@ -51,7 +51,7 @@ examples:
     replay drive_01 --publish --rate 0.5
 
 exit codes: 0 done, 1 recomputed and recorded differ (--compare), 2 bad arguments or files, 3 they differ, but the
-recording begins in the middle of a run, 130 interrupted
+recording lacks steps (it began in the middle of a run) whose memory may explain all of it, 130 interrupted
 """
 
 
@@ -161,9 +161,13 @@ def _replay(bag: BagReader, options: argparse.Namespace) -> int:
         lines += _comparison_lines(report)
     code = DONE
     if options.compare and exceeds(report.comparison, options.tolerance):
-        code = CANNOT_TELL if report.late_start else FAILED
-    if code == CANNOT_TELL:
-        lines.append("  cannot tell: the recording begins in the middle of a run; start the recorder first")
+        code = CANNOT_TELL if report.gaps and not report.changed else FAILED
+        if code == CANNOT_TELL:
+            lines.append(
+                "  cannot tell: the recording lacks steps whose memory may explain it; start the recorder first"
+            )
+        elif report.gaps:
+            lines.append(f"  {report.changed} step(s) differ whatever the law remembered of those the recording lacks")
     _show(lines, result, options)
     return code
 

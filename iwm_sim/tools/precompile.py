@@ -27,6 +27,8 @@ def jobs() -> Iterator[Job]:
     import numpy as np
 
     from iwm_power_manager.control import law
+    from iwm_power_manager.control.record import DECIDED_NAMES, SIGNALS
+    from iwm_power_manager.control.repeat import repeat
     from iwm_power_manager.control.settings import default_settings
     from iwm_power_manager.control.types import Measurement, initial_state
     from iwm_power_manager.cycle import Cycle
@@ -51,6 +53,8 @@ def jobs() -> Iterator[Job]:
         discharge, charge = battery_limits_w(0.8, 25.0, vehicle.params.battery)
         measurement = Measurement(1.0, (3.0, 3.0, 3.0, 3.0), 500.0, 0.01, 0.9, discharge, charge, 0.8)
         law.step(measurement, initial_state(), settings, vehicle.params, table)
+        steps = np.zeros((0, len(SIGNALS)))
+        repeat(steps, initial_state(), settings, vehicle.params, table, np.zeros((0, len(DECIDED_NAMES))))
 
     def simulated_car() -> None:
         drive = Drive(on_cycle(vehicle, cycle, 0.9), dt_s=0.01)

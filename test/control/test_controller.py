@@ -17,7 +17,7 @@ from iwm_power_manager.control import controller as module
 from iwm_power_manager.control import law
 from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
-from iwm_power_manager.control.record import SIGNAL_NAMES, SIGNALS, from_numbers
+from iwm_power_manager.control.record import SIGNAL_NAMES, SIGNALS, completed, from_numbers, step_of
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.supervision import (
     MODE_DEGRADED,
@@ -328,12 +328,12 @@ class TestRecord:
         drive.run(50, demand=-3000.0)
         state = initial_state()
         for values, command in zip(drive.steps, drive.commands, strict=True):
-            recorded = from_numbers(values)
+            recorded = from_numbers(list(values.values()))
             if recorded.first:
                 state = initial_state()
             again, state = law.step(recorded.measurement, state, recorded.settings, VEHICLE, empty_table())
             assert again == command
-        assert sum(from_numbers(values).first for values in drive.steps) == 2
+        assert sum(from_numbers(list(values.values())).first for values in drive.steps) == 2
 
     def test_reset_forgets_inputs_and_memory(self, drive) -> None:
         drive.run(60, demand=9000.0)
@@ -345,7 +345,7 @@ class TestRecord:
         assert drive.step()["stale"] != 0
 
     def test_settings_come_back_with_the_types_the_law_was_compiled_for(self, drive) -> None:
-        settings_again = from_numbers(drive.run(1)).settings
+        settings_again = from_numbers(list(drive.run(1).values())).settings
         assert settings_again == default_settings("equal")
         assert [type(a) for a in settings_again] == [type(b) for b in default_settings("equal")]
 
@@ -353,7 +353,19 @@ class TestRecord:
         values = drive.run(1)
         del values["dt_s"]
         with pytest.raises(KeyError):
-            from_numbers(values)
+            completed(list(values), list(values.values()))
+
+    @pytest.mark.parametrize("number", [math.nan, math.inf, -1.0, 1e300])
+    @pytest.mark.parametrize("name", ["step", "setting.strategy"])
+    def test_what_counts_or_chooses_nothing_is_refused(self, drive, name: str, number: float) -> None:
+        values = drive.run(1) | {name: number}
+        with pytest.raises(ValueError):
+            step_of(list(values.values()))
+            from_numbers(list(values.values()))
+
+    def test_an_unknown_strategy_is_refused(self, drive) -> None:
+        with pytest.raises(ValueError, match="strategy 99 does not exist"):
+            from_numbers(list((drive.run(1) | {"setting.strategy": 99.0}).values()))
 
 
 class TestFaultOfTheLaw:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -260,17 +261,62 @@ def test_missing_steps_are_reported_because_the_memory_of_the_law_is_then_unknow
     assert "without counterpart: 3 recorded, 0 recomputed" in text
 
 
+def without_its_start(drive: Path, path: Path, first: int) -> str:
+    """A recording that began at step `first` of a drive."""
+    with BagReader(drive) as source, BagWriter(path, custom_data=source.custom_data) as bag:
+        numbers = {name: bag.add_topic(topic) for name, topic in source.topics.items()}
+        for message in source.messages():
+            if message.sequence >= first:
+                bag.write(numbers[message.topic], message.log_time_ns, message.data)
+    return str(path)
+
+
 def test_a_recording_that_begins_in_the_middle_of_a_run_is_no_verdict(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with BagReader(drive) as source, BagWriter(tmp_path / "late") as bag:
-        numbers = {name: bag.add_topic(topic) for name, topic in source.topics.items()}
-        for message in source.messages():
-            if message.sequence >= 40:
-                bag.write(numbers[message.topic], message.log_time_ns, message.data)
-    assert main([str(tmp_path / "late"), "--compare"]) == CANNOT_TELL
+    assert main([without_its_start(drive, tmp_path / "late", 40), "--compare"]) == CANNOT_TELL
     last = capsys.readouterr().out.splitlines()[-1]
-    assert last == "  cannot tell: the recording begins in the middle of a run; start the recorder first"
+    assert last == "  cannot tell: the recording lacks steps whose memory may explain it; start the recorder first"
+
+
+class CalmDrive(ScriptedDrive):
+    """Sensors that agree, and a demand that jumps now and then: nothing to remember from before the first jump."""
+
+    def inputs(self, i: int) -> tuple[float, list[float], float]:
+        """Speed, wheel speeds and demand of step `i`."""
+        return 8.0, [8.0 / 0.33] * 4, (0.0, 9000.0)[i // 100 % 2]
+
+
+@pytest.mark.parametrize("first", [40, 90])
+def test_a_change_is_told_from_a_late_start(first: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drive = CalmDrive("equal").write(tmp_path / "drive", 900)
+    late = without_its_start(drive, tmp_path / "late", first)
+    assert main([late, "--compare"]) != FAILED
+    capsys.readouterr()
+    assert main([late, "--compare", "--set", "slew_up_nmps=200"]) == FAILED
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.endswith("step(s) differ whatever the law remembered of those the recording lacks")
+    assert int(last.split()[0]) > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "number"), [("step", math.inf), ("setting.strategy", 99.0), ("setting.gate_mode", 1e300)]
+)
+def test_a_state_that_no_law_can_have_had_is_a_bad_message(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, number: float
+) -> None:
+    read, write = joint_state_reader("position"), joint_state_writer(SIGNAL_NAMES, "position")
+    with BagReader(drive) as old, BagWriter(tmp_path / "bad", custom_data=old.custom_data) as new:
+        numbers = {topic: new.add_topic(found) for topic, found in old.topics.items()}
+        for message in old.messages():
+            data = message.data
+            if message.topic.endswith(STATE) and message.sequence == 20:
+                found = read(data)
+                values = dict(zip(found.names, found.values, strict=True)) | {name: number}
+                data = write(found.stamp_ns, list(values.values()))
+            new.write(numbers[message.topic], message.log_time_ns, data)
+    main([str(tmp_path / "bad"), "--compare"])
+    assert "1 bad messages skipped" in capsys.readouterr().out
 
 
 def test_a_command_recorded_under_another_name_is_named(
@@ -614,7 +660,7 @@ def test_a_state_of_another_version_is_refused_by_name(tmp_path: Path, capsys: p
         number = bag.add_topic(topic("/power_manager/state", "sensor_msgs/msg/JointState"))
         bag.write(number, 1, joint_state_writer(("speed_mps",), "position")(1, (2.0,)))
     assert main([str(tmp_path / "bag"), "--compare"]) == BAD_INPUT
-    assert "lacks the signal 'step': recorded by another version" in capsys.readouterr().err
+    assert "lacks the signal 'front_left_speed_radps': recorded by another version" in capsys.readouterr().err
 
 
 def test_progress_is_called_with_messages_and_time(drive: Path) -> None:
