@@ -156,7 +156,7 @@ def step_cost_and_next(
     """
     if problem.slip_model == SLIP_QUASI_STEADY:
         before = settled(power_demand_w, speed_mps, vehicle, problem)
-        return settled_step(before, power_demand_w, speed_mps, front_share, vehicle, problem)
+        return settled_step(before, power_demand_w, speed_mps, front_share, False, vehicle, problem)
     start = given(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
     moved = step_from(start.before, start.torques, start.before, problem.friction, UNSURE, problem.dt_s, vehicle)
     return outcome_of(power_demand_w, start, moved, vehicle, problem)
@@ -180,7 +180,7 @@ def step_near(
     """
     if problem.slip_model == SLIP_QUASI_STEADY:
         before = settled(power_demand_w, speed_mps, vehicle, problem)
-        return settled_step(before, power_demand_w, speed_mps, front_share, vehicle, problem), guess
+        return settled_step(before, power_demand_w, speed_mps, front_share, False, vehicle, problem), guess
     start = given(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
     moved = step_from(start.before, start.torques, guess, problem.friction, curves, problem.dt_s, vehicle)
     return outcome_of(power_demand_w, start, moved, vehicle, problem), moved.speeds
@@ -342,12 +342,18 @@ def settled_step(
     power_demand_w: float,
     speed_mps: float,
     front_share: float,
+    least: bool,
     vehicle: VehicleParams,
     problem: ProblemParams,
 ) -> Step:
-    """`step_cost_and_next` with settled slip, from what `settled` says of the same demand and speed."""
+    """`step_cost_and_next` with settled slip, from what `settled` says of the same demand and speed.
+
+    Where a bound of the cost will do, never larger but for rounding, `least` spares solving for the slip.
+    """
     battery, force = vehicle.battery, before.force_n
-    power, missing, over = split_outcome_w(before.axles, force, speed_mps, front_share, problem.friction, True, vehicle)
+    power, missing, over = split_outcome_w(
+        before.axles, force, speed_mps, front_share, problem.friction, True, least, vehicle
+    )
     shortfall = 0.0
     if power_demand_w > 0.0:
         shortfall = missing * speed_mps + max(power - chemical_power_w(battery.discharge_limit_w, battery), 0.0)

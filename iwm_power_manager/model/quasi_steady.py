@@ -15,8 +15,8 @@ from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, normal_forces_n, road_load_n
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
-from iwm_power_manager.model.parameters import Axle, VehicleParams
-from iwm_power_manager.model.tyre import peak_ratio, slip_at_friction, wheel_speed_at_slip
+from iwm_power_manager.model.parameters import Axle, Motor, VehicleParams
+from iwm_power_manager.model.tyre import least_slip_at_friction, peak_ratio, slip_at_friction, wheel_speed_at_slip
 
 #: Part of the peak friction a strategy plans with. The rest is the distance the slip limiter keeps from the peak.
 USABLE_FRICTION = 0.99
@@ -24,22 +24,49 @@ USABLE_FRICTION = 0.99
 
 @kernel
 def axle_power_w(
-    force_n: float, speed_mps: float, normal_n: float, friction: float, slip_aware: bool, axle: Axle
+    force_n: float,
+    speed_mps: float,
+    normal_n: float,
+    friction: float,
+    slip_aware: bool,
+    least: bool,
+    axle: Axle,
 ) -> float:
     """Electrical power of an axle's two motors, W, for the axle's road force (braking negative).
 
-    Braking beyond the regeneration limit is friction's and brings nothing.
+    Braking beyond the regeneration limit is friction's and brings nothing. Where a bound will do, never larger but for
+    rounding, `least` mostly spares solving for the slip.
     """
     radius = axle.wheel.radius_m
     motor = axle.motor
-    slip = 0.0
-    if slip_aware and normal_n > 0.0:
-        slip = slip_at_friction(0.5 * force_n / normal_n, friction, axle.tyre)
-    wheel_speed = wheel_speed_at_slip(slip, speed_mps, radius)
     torque = 0.5 * force_n * radius
+    wheel_speed = speed_mps / radius
+    if slip_aware and normal_n > 0.0:
+        used = 0.5 * force_n / normal_n
+        bounded = False
+        if least:
+            wheel_speed = wheel_speed_at_slip(least_slip_at_friction(used, friction, axle.tyre), speed_mps, radius)
+            bounded = _slip_costs(torque, wheel_speed, speed_mps, motor)
+        if not bounded:
+            wheel_speed = wheel_speed_at_slip(slip_at_friction(used, friction, axle.tyre), speed_mps, radius)
     if torque < 0.0:
         torque = -min(-torque, regeneration_limit_nm(wheel_speed, speed_mps, 0.0, motor))
     return 2.0 * electrical_power_w(torque, wheel_speed, motor)
+
+
+@kernel
+def _slip_costs(torque_nm: float, wheel_speed_radps: float, speed_mps: float, motor: Motor) -> bool:
+    """Whether all further slip surely takes more power: driving, the wheel turns faster then; braking, slower.
+
+    The loss is a polynomial of the speed that bends upwards, so that what holds at this speed holds beyond.
+    """
+    if motor.map_torque_nm.shape[0] > 0 or motor.loss_quadratic_speed < 0.0:
+        return False
+    by_speed = torque_nm + motor.loss_linear_speed + 2.0 * motor.loss_quadratic_speed * wheel_speed_radps
+    if torque_nm > 0.0:
+        return by_speed >= 0.0
+    # The limit of regeneration only rises as the wheel slows down.
+    return by_speed <= 0.0 and -torque_nm <= regeneration_limit_nm(wheel_speed_radps, speed_mps, 0.0, motor)
 
 
 class Axles(NamedTuple):
@@ -89,7 +116,7 @@ def split_power_w(
 ) -> tuple[float, float]:
     """Chemical battery power for a road force at a front share, W, and the force that cannot be delivered, N."""
     axles = axles_of(force_n, speed_mps, friction, slip_aware, vehicle)
-    power, missing, _ = split_outcome_w(axles, force_n, speed_mps, front_share, friction, slip_aware, vehicle)
+    power, missing, _ = split_outcome_w(axles, force_n, speed_mps, front_share, friction, slip_aware, False, vehicle)
     return power, missing
 
 
@@ -101,6 +128,7 @@ def split_outcome_w(
     front_share: float,
     friction: float,
     slip_aware: bool,
+    least: bool,
     vehicle: VehicleParams,
 ) -> tuple[float, float, float]:
     """Chemical battery power for a road force at a front share, and what the axles could not do of it.
@@ -113,6 +141,7 @@ def split_outcome_w(
     front_share : front axle's part of the force, 0..1; at 0 and 1 the other axle is idle
     friction : peak friction coefficient
     slip_aware : False ignores slip, load transfer and the tyre's limit
+    least : a bound of the power will do, which is never larger and takes half of the time
 
     Returns
     -------
@@ -141,9 +170,9 @@ def split_outcome_w(
     given_front = min(need_front + need_rear - given_rear, axles.front_room_n)
     missing = need_front + need_rear - given_front - given_rear
 
-    power = axle_power_w(
-        sign * given_front, speed_mps, axles.front_load_n, friction, slip_aware, vehicle.front
-    ) + axle_power_w(sign * given_rear, speed_mps, axles.rear_load_n, friction, slip_aware, vehicle.rear)
+    front_n, rear_n = sign * given_front, sign * given_rear
+    power = axle_power_w(front_n, speed_mps, axles.front_load_n, friction, slip_aware, least, vehicle.front)
+    power += axle_power_w(rear_n, speed_mps, axles.rear_load_n, friction, slip_aware, least, vehicle.rear)
     return chemical_power_w(power, vehicle.battery), missing, over
 
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iwm_power_manager.model import tyre as model
 from iwm_power_manager.model.quasi_steady import axle_power_w, demand_force_n, split_power_w
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -41,12 +42,46 @@ SHARE = st.one_of(st.sampled_from([0.0, 0.5, 1.0]), st.floats(0.01, 0.99))
     st.booleans(),
 )
 def test_an_axle_takes_the_power_of_its_two_motors_at_the_settled_slip(force, speed, normal, friction, slip_aware):
-    ours = axle_power_w(force, speed, normal, friction, slip_aware, CAR.front)
+    ours = axle_power_w(force, speed, normal, friction, slip_aware, False, CAR.front)
     assert ours == pytest.approx(axle_w(force, speed, normal, friction, slip_aware, CAR.front), rel=1e-5, abs=1e-3)
 
 
+@given(
+    st.floats(-3000.0, 1500.0),
+    st.floats(1.0, 40.0),
+    st.floats(500.0, 3000.0),
+    st.sampled_from([0.9, 0.2]),
+    st.sampled_from([(10.0, 1.9, 1.0, 0.97), (10.0, 1.9, 1.0, -3.0), (30.0, 0.7)]),
+    st.tuples(*[st.floats(-3.0, 3.0)] * 2, *[st.floats(-0.5, 0.5)] * 2),
+)
+def test_the_bound_of_an_axle_s_power_is_one_for_every_tyre_and_every_loss(
+    force, speed, normal, friction, numbers, loss
+):
+    name = "magic_formula" if len(numbers) == 4 else "fiala"
+    tyre = model.make(name, dict(zip(model.MODELS[name].ranges, numbers, strict=True)), 0.5)
+    motor = CAR.front.motor._replace(
+        loss_linear_speed=loss[0],
+        loss_linear_torque=loss[1],
+        loss_quadratic_speed=loss[2],
+        loss_quadratic_torque=loss[3],
+    )
+    axle = CAR.front._replace(tyre=tyre, motor=motor)
+    exact = axle_power_w(force, speed, normal, friction, True, False, axle)
+    assert axle_power_w(force, speed, normal, friction, True, True, axle) <= exact + 1e-9 * (1.0 + abs(exact))
+
+
+@pytest.mark.parametrize("force", [300.0, -300.0])
+def test_the_bound_of_an_axle_s_power_is_near_where_little_slips(force):
+    exact = axle_power_w(force, 15.0, 2000.0, 0.9, True, False, CAR.front)
+    rolling = axle_power_w(force, 15.0, 2000.0, 0.9, False, False, CAR.front)
+    assert rolling < axle_power_w(force, 15.0, 2000.0, 0.9, True, True, CAR.front) <= exact
+    assert exact - axle_power_w(force, 15.0, 2000.0, 0.9, True, True, CAR.front) < 0.01 * (exact - rolling)
+
+
 def test_an_axle_in_the_air_slips_no_further_than_rolling():
-    assert axle_power_w(100.0, 10.0, 0.0, 0.9, True, CAR.front) == axle_power_w(100.0, 10.0, 1e9, 0.9, False, CAR.front)
+    assert axle_power_w(100.0, 10.0, 0.0, 0.9, True, False, CAR.front) == axle_power_w(
+        100.0, 10.0, 1e9, 0.9, False, False, CAR.front
+    )
 
 
 @given(

@@ -36,11 +36,11 @@ def cheapest_share(
     force = demand_force_n(situation.power_demand_w, situation.speed_mps, friction, slip_aware, vehicle)
     speed = max(situation.speed_mps, vehicle.driver.power_speed_floor_mps)
     axles = axles_of(force, speed, friction, slip_aware, vehicle)
-    power, missing, _ = split_outcome_w(axles, force, speed, previous, friction, slip_aware, vehicle)
+    power, missing, _ = split_outcome_w(axles, force, speed, previous, friction, slip_aware, False, vehicle)
     best = previous
     best_power = power + PRICE_OF_MISSING * missing * speed - LEAST_DIFFERENCE_W
     for k in range(policy.share.size):
-        power, missing, _ = split_outcome_w(axles, force, speed, policy.share[k], friction, slip_aware, vehicle)
+        power, missing, _ = split_outcome_w(axles, force, speed, policy.share[k], friction, slip_aware, False, vehicle)
         power += PRICE_OF_MISSING * missing * speed + switching_power_w
         if power < best_power:
             best_power = power

@@ -8,6 +8,7 @@ only, and what is noise of the demand is averaged out (`control.persistence`).
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from iwm_power_manager.control.budget import affordable, price_factor, price_level, price_units
@@ -35,6 +36,8 @@ Cell = tuple[int, float]  # as `locate` gives it
 
 #: From this gain on a demand counts as it is: averaging would change nothing that matters.
 _LASTING = 0.99
+#: Part of a cost that sums and products may lose.
+_ROUNDING = 1e-9
 
 
 class _Ahead(NamedTuple):
@@ -60,10 +63,10 @@ def _ahead(power_demand_w: float, situation: Situation, vehicle: VehicleParams, 
 
 
 @kernel
-def _cell_of(k: int, policy: PolicyTable) -> Cell:
-    """Where the k-th share lies among the previous shares, which mostly are the same ones."""
-    axis, share = policy.previous_share, policy.share[k]
-    if k < axis.size and axis[k] == share:
+def _cell_of(k: int, share: float, policy: PolicyTable) -> Cell:
+    """Where a share, perhaps the k-th, lies among the previous shares, which mostly are the same ones."""
+    axis = policy.previous_share
+    if 0 <= k < axis.size and axis[k] == share:
         return k, 0.0
     return locate(axis, share)
 
@@ -78,17 +81,22 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
     price = factor * policy.switching_cost_j
     budgeted = policy.changes_per_min > 0.0
     ahead = _ahead(situation.power_demand_w, situation, vehicle, policy)
-    best = previous
-    stay = locate(policy.previous_share, previous)
-    best_cost = _cost_j(ahead, situation, previous, stay, level, vehicle, policy)
-    best_cost -= LEAST_DIFFERENCE_W * policy.problem.dt_s
-    for k in range(policy.share.size):
-        share = policy.share[k]
-        move = share - previous
-        if move == 0.0 or not affordable(share, previous, used, policy.changes_per_min):
-            continue
-        switching = price * (price_units(move) if budgeted else abs(move)) + policy.switching_fixed_cost_j
-        cost = _cost_j(ahead, situation, share, _cell_of(k, policy), level, vehicle, policy) + switching
+    # Each kernel is called in one place, so that the compiler puts it there: a car and a policy are much to pass on.
+    best, best_cost = previous, math.inf
+    for k in range(-1, policy.share.size):
+        share, switching = previous, -LEAST_DIFFERENCE_W * policy.problem.dt_s
+        if k >= 0:
+            share = policy.share[k]
+            move = share - previous
+            if move == 0.0 or not affordable(share, previous, used, policy.changes_per_min):
+                continue
+            switching = price * (price_units(move) if budgeted else abs(move)) + policy.switching_fixed_cost_j
+        cell = _cell_of(k, share, policy)
+        # Most shares are worse for certain than the best so far, before anything is solved for them.
+        for least in (policy.problem.slip_model == SLIP_QUASI_STEADY, False):
+            cost = _cost_j(ahead, situation, share, cell, least, level, vehicle, policy) + switching
+            if cost - _ROUNDING * abs(cost) >= best_cost:
+                break
         if cost < best_cost:
             best_cost = cost
             best = share
@@ -101,6 +109,7 @@ def _cost_j(
     situation: Situation,
     share: float,
     cell: Cell,
+    least: bool,
     level: float,
     vehicle: VehicleParams,
     policy: PolicyTable,
@@ -112,20 +121,22 @@ def _cost_j(
     if policy.changes_per_min > 0.0 and demand_w > 0.0:
         trust = TRUST
         steps = TRUST + (1.0 - TRUST) * WORTH_S / policy.problem.dt_s
-    if gain > _LASTING:
-        return _demand_cost_j(ahead, demand_w, situation, share, cell, level, steps, trust, vehicle, policy)
-    steps += held_s(gain) / policy.problem.dt_s
-    total = gain * _demand_cost_j(ahead, demand_w, situation, share, cell, level, steps, trust, vehicle, policy)
-    weights = gain
+    samples = 0
+    if gain <= _LASTING:
+        samples = min(SAMPLES, situation.jitter.taken)
+        steps += held_s(gain) / policy.problem.dt_s
+    total = weights = 0.0
     weight = gain
-    for i in range(min(SAMPLES, situation.jitter.taken)):
-        weight *= 1.0 - gain
-        sample_w = situation.jitter.samples_w[i]
-        sampled = _ahead(sample_w, situation, vehicle, policy)
+    for i in range(-1, samples):
+        if i >= 0:
+            demand_w = situation.jitter.samples_w[i]
+            ahead = _ahead(demand_w, situation, vehicle, policy)
+        cost = _demand_cost_j(ahead, demand_w, situation, share, cell, least, level, steps, trust, vehicle, policy)
+        if gain > _LASTING:
+            return cost
+        total += weight * cost
         weights += weight
-        total += weight * _demand_cost_j(
-            sampled, sample_w, situation, share, cell, level, steps, trust, vehicle, policy
-        )
+        weight *= 1.0 - gain
     return total / weights
 
 
@@ -136,6 +147,7 @@ def _demand_cost_j(
     situation: Situation,
     share: float,
     cell: Cell,
+    least: bool,
     level: float,
     steps: float,
     trust: float,
@@ -145,7 +157,7 @@ def _demand_cost_j(
     """Right-hand side of eq. 31 for one demand and one share, J, without the price of the change.
 
     `cell` is the share's among the previous shares, `steps` how many times the step's cost counts, `trust` the part of
-    what follows.
+    what follows; `least` asks for a bound, never larger but for rounding.
     """
     speed, problem = situation.speed_mps, policy.problem
     a, fa = ahead.power
@@ -154,7 +166,7 @@ def _demand_cost_j(
     d, fd = ahead.slip_rear
     e, fe = cell
     if problem.slip_model == SLIP_QUASI_STEADY:
-        outcome = settled_step(ahead.settled, power_demand_w, speed, share, vehicle, problem)
+        outcome = settled_step(ahead.settled, power_demand_w, speed, share, least, vehicle, problem)
     else:
         outcome = step_cost_and_next(
             power_demand_w, speed, situation.front_slip, situation.rear_slip, share, vehicle, problem

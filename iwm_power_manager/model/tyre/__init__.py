@@ -21,6 +21,7 @@ __all__ = [
     "TyreModel",
     "friction_and_slope",
     "friction_coefficient",
+    "least_slip_at_friction",
     "make",
     "numbers",
     "peak_ratio",
@@ -87,6 +88,14 @@ def slip_at_friction(friction: float, peak_friction: float, tyre: Tyre) -> float
     if tyre.model == _FIALA:
         return fiala.slip_at_friction(friction, peak_friction, tyre.coefficients)
     return magic_formula.slip_at_friction(friction, peak_friction, tyre.coefficients)
+
+
+@kernel
+def least_slip_at_friction(friction: float, peak_friction: float, tyre: Tyre) -> float:
+    """A slip of the same sign as `slip_at_friction` and never larger, without solving for it."""
+    if tyre.model == _FIALA:
+        return fiala.least_slip_at_friction(friction, peak_friction, tyre.coefficients)
+    return magic_formula.least_slip_at_friction(friction, peak_friction, tyre.coefficients)
 
 
 @kernel

@@ -54,3 +54,9 @@ def slip_at_friction(friction: float, peak_friction: float, coefficients: TyreCo
     ratio = min(abs(friction) / peak_friction, 1.0)
     slip = 3.0 * peak_friction / coefficients[0] * (1.0 - (1.0 - ratio) ** (1.0 / 3.0))
     return slip if friction > 0.0 else -slip
+
+
+@kernel
+def least_slip_at_friction(friction: float, peak_friction: float, coefficients: TyreCoefficients) -> float:
+    """A bound of `slip_at_friction`, never larger: the curve lies below its tangent at the origin."""
+    return min(max(friction, -peak_friction), peak_friction) / coefficients[0]

@@ -16,9 +16,6 @@ RANGES = {
     "curvature_factor": (-10.0, 1.0),
 }
 
-#: A step of the inverse this small (relative) leaves rounding.
-_SMALL = 3e-6
-
 
 @kernel
 def friction_coefficient(slip: float, peak_friction: float, coefficients: TyreCoefficients) -> float:
@@ -49,22 +46,26 @@ def slip_at_friction(friction: float, peak_friction: float, coefficients: TyreCo
     if peak <= 0.0 or friction == 0.0:
         return 0.0
     ratio = min(abs(friction) / peak, 1.0)
-    # sin(C atan(y)) = ratio  ->  y; then (1 - E) x + E atan(x) = y, from its series at small slips: by Halley's method,
-    # and where the curvature is no small correction by Newton's, since the left side rises and bends one way.
+    # sin(C atan(y)) = ratio  ->  y; then (1 - E) x + E atan(x) = y by Newton: the left side rises and bends down.
     y = math.tan(math.asin(ratio) / c)
-    x = y + e / 3.0 * y * min(y * y, 0.25)
+    x = y
     for _ in range(50):
-        per = 1.0 / (1.0 + x * x)
-        slope = 1.0 - e * x * x * per
-        step = ((1.0 - e) * x + e * math.atan(x) - y) / slope
-        bend = -e * x * per * per * step / slope
-        if abs(bend) < 0.25:
-            step /= 1.0 - bend
+        step = ((1.0 - e) * x + e * math.atan(x) - y) / (1.0 - e * x * x / (1.0 + x * x))
         x -= step
-        # What is left goes with the cube of the step.
-        if abs(step) <= _SMALL * (1.0 + abs(x)):
+        if abs(step) <= 1e-13 * (1.0 + abs(x)):
             break
     slip = x / b
+    return slip if friction > 0.0 else -slip
+
+
+@kernel
+def least_slip_at_friction(friction: float, peak_friction: float, coefficients: TyreCoefficients) -> float:
+    """A bound of `slip_at_friction`, never larger: with E >= 0 the curve lies below its tangent at the origin."""
+    b, c, d, e = coefficients
+    peak = peak_friction * d
+    if peak <= 0.0 or e < 0.0:
+        return 0.0
+    slip = min(abs(friction) / peak, 1.0) / (b * c)
     return slip if friction > 0.0 else -slip
 
 
