@@ -127,7 +127,7 @@ class Thresholds:
     )
     # At 20 m/s the car has moved a metre.
     command_oldest_s: float = _threshold(
-        0.05, "s", 0.001, 1.0, "a command that took longer from its inputs to its sending is not sent"
+        0.05, "s", 0.001, 1.0, "age no command may have when DDS sends it, half of it for DDS: an older one is not sent"
     )
 
 

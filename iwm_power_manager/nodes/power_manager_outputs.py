@@ -88,16 +88,17 @@ class Outputs:
         return answer
 
     def publish(self, answer: list[tuple[str, bytes]], may_send: Callable[[float], bool] = lambda _: True) -> bool:
-        """Publish messages, each only if `may_send` allows it at that moment (monotonic s); False if it did not."""
+        """Publish messages; no command any more once `may_send` forbids one at its moment (monotonic s), then False."""
+        allowed = True
         for topic, data in answer:
             publisher = self._publishers[topic]
             send = publisher.handle.publish_raw  # nothing more stands between the look at the clock and DDS
             if not publisher.is_activated:
                 continue
-            if not may_send(time.monotonic()):
-                return False
+            if topic in self.topics and not (allowed := allowed and may_send(time.monotonic())):
+                continue
             send(data)
-        return True
+        return allowed
 
     def zero(self, now_ns: int) -> None:
         """Command zero torque."""
