@@ -18,7 +18,7 @@ from iwm_sim.study.battery_fit import Estimate
 from iwm_sim.study.cases import Case, cycle_of
 from iwm_sim.study.criteria import Criterion
 from iwm_sim.study.paper import Consequences
-from iwm_sim.study.rows import Row
+from iwm_sim.study.rows import Row, policy_text
 from iwm_sim.study.skid import Stopped
 
 FORMAT = 2
@@ -45,15 +45,24 @@ class FrontierPoint:
     price: str
     saving_percent: float | None
     share_changes_per_min: float
+    policy: str = ""
 
 
 @dataclass(frozen=True)
 class Frontier:
-    """Saving against changes of the share, along the price of a change."""
+    """Saving against changes of the share, along the price of a change; how it was driven, as a reader is told it."""
 
     cycle: str
     friction: float
     points: list[FrontierPoint]
+    dt_s: float = 0.01
+    decision_period_s: float = 0.02
+
+    @property
+    def place(self) -> str:
+        """Where and how it was driven."""
+        law = f"control at {1.0 / self.dt_s:g} Hz, split decided every {self.decision_period_s:g} s"
+        return f"{self.cycle}, friction {self.friction:g}, idle drive none, {law}"
 
 
 @dataclass(frozen=True)
@@ -164,5 +173,7 @@ def frontier_of(base: Case, rows: Sequence[Row]) -> Frontier:
     points = []
     for row in rows:
         family, price = row.label.split("|")
-        points.append(FrontierPoint(family, price, row.saving_percent, row.metrics.share_changes_per_min))
-    return Frontier(cycle_of(base.cycle).name, base.friction, points)
+        made = (row.saving_percent, row.metrics.share_changes_per_min, policy_text(row))
+        points.append(FrontierPoint(family, price, *made))
+    period_s = base.settings.decision_period_s
+    return Frontier(cycle_of(base.cycle).name, base.friction, points, base.dt_s, period_s)

@@ -24,11 +24,13 @@ import numpy.typing as npt
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.cycle import Cycle
+from iwm_power_manager.policy import Policy
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import closed_loop, preview
 from iwm_sim.closed_loop import Noise, Run
 from iwm_sim.metrics import Metrics, measure, share_changes
 from iwm_sim.study import generate
+from iwm_sim.study.report import Column
 from iwm_sim.study.rows import saving_percent
 
 FloatArray = npt.NDArray[np.float64]
@@ -45,6 +47,26 @@ COUNTS = ("changes_per_min", "fine_changes_per_min", "travel_per_min")
 FINE_CHANGE = 0.05
 
 _DT_S = 0.01
+
+
+def _setting(point: Point) -> str:
+    if point.strategy == "instantaneous":
+        return ""
+    return f"{point.setting:g} {'W' if point.strategy == RIVAL else 'changes/min'}"
+
+
+#: Columns of a table of points.
+POINT_COLUMNS: tuple[Column[Point], ...] = (
+    Column("strategy", lambda point: point.strategy),
+    Column("threshold or budget", _setting),
+    Column("changes/min > 0.25", lambda point: point.changes_per_min, decimals=1),
+    Column("> 0.05", lambda point: point.fine_changes_per_min, decimals=1),
+    Column("moves/min", lambda point: point.travel_per_min, decimals=1),
+    Column("busiest minute", lambda point: point.busiest_minute, decimals=0),
+    Column("saving %", lambda point: point.saving_percent, decimals=3),
+    Column("trace", lambda point: "held" if point.held else "lost"),
+    Column("policy", lambda point: point.policy),
+)
 
 
 class Place(NamedTuple):
@@ -76,6 +98,7 @@ class Point(NamedTuple):
     travel_per_min : sum of all moves, 1 being all the power
     busiest_minute : most changes in any minute
     held : whether this run and that of equal split held the trace
+    policy : grid and checksum of the policy it was driven with, of ours
     """
 
     strategy: str
@@ -86,12 +109,14 @@ class Point(NamedTuple):
     travel_per_min: float
     busiest_minute: int
     held: bool
+    policy: str = ""
 
 
 class Frontier(NamedTuple):
-    """All points of a place; `bound` has no more changes than the point of ours it stands for."""
+    """All points of a place, and what they were driven with; a bound has no more changes than its point of ours."""
 
     label: str
+    made_with: str
     rivals: tuple[Point, ...]
     ours: tuple[Point, ...]
     bounds: tuple[Point, ...]
@@ -142,7 +167,7 @@ def _point(strategy: str, setting: float, run: Run, place: Place, reference: _Re
 
 def measure_frontier(
     place: Place,
-    policies: Sequence[tuple[float, PolicyTable]],
+    policies: Sequence[Policy],
     thresholds_w: Sequence[float] = THRESHOLDS_W,
     bounds: bool = False,
 ) -> Frontier:
@@ -150,7 +175,7 @@ def measure_frontier(
 
     Parameters
     ----------
-    policies : of ours: budget in changes a minute, and the policy solved for it
+    policies : of ours, each solved for a budget of changes
     thresholds_w : of the rival
     bounds : whether to look for the bound of each of our points as well
     """
@@ -163,12 +188,15 @@ def measure_frontier(
     blind = drive(place, "instantaneous", empty_table())
     rivals.append(_point("instantaneous", 0.0, blind, place, reference))
     ours, limits = [], []
-    for budget, table in policies:
-        run = drive(place, OURS, table)
-        ours.append(_point(OURS, budget, run, place, reference))
+    for policy in policies:
+        run = drive(place, OURS, policy.table())
+        point = _point(OURS, policy.problem.changes_per_min, run, place, reference)
+        ours.append(point._replace(policy=f"{policy.problem.name} {policy.checksum[:8]}"))
         if bounds:
             limits.append(_bound(place, reference, run, [*rivals, ours[-1]], ours[-1]))
-    return Frontier(place.label, tuple(rivals), tuple(ours), tuple(limits))
+    law = f"control at {1.0 / _DT_S:g} Hz, split decided every {default_settings().decision_period_s:g} s"
+    made_with = f"friction {place.friction:g}, idle drive {place.vehicle.idle_drive}, {law}"
+    return Frontier(place.label, made_with, tuple(rivals), tuple(ours), tuple(limits))
 
 
 def margin(point: Point, rivals: Sequence[Point], count: str) -> float | None:
@@ -191,7 +219,7 @@ def _bound(place: Place, reference: _Reference, ours: Run, others: Sequence[Poin
         table = empty_table(schedule=share.tolist())
         found.append(_point("preview", point.setting, drive(place, "preview", table), place, reference))
     best = max(found, key=lambda p: -np.inf if p.saving_percent is None else p.saving_percent)
-    return best._replace(strategy="preview", setting=point.setting)
+    return best._replace(strategy="preview", setting=point.setting, policy="")
 
 
 def _schedule(place: Place, run: Run, changes_per_min: float) -> FloatArray:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -42,7 +43,9 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("saving against equal split, %")
     axes[0].legend(frameon=False)
-    figure.suptitle(frontier.label)
+    policies = ", ".join(point.policy for point in frontier.ours)
+    words = textwrap.fill(f"{frontier.made_with}; policies of ours: {policies}", 150)
+    figure.suptitle(f"{frontier.label}\n{words}", fontsize="medium")
     _save(figure, path)
 
 

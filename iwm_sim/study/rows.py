@@ -103,6 +103,12 @@ def saving_percent(one: Metrics, reference: Metrics) -> float | None:
     return 100.0 * (1.0 - one.energy_wh / reference.energy_wh)
 
 
+def policy_text(row: Row) -> str:
+    """Grid and checksum of a row's policy; "" without one."""
+    made = row.made_with
+    return f"{made['policy_grid']} {made['policy_checksum'][:8]}" if made.get("policy_checksum") else ""
+
+
 def by_place(rows: Iterable[Row]) -> dict[Place, dict[str, Row]]:
     """Rows by place, and there by label."""
     result: dict[Place, dict[str, Row]] = {}

@@ -189,8 +189,7 @@ def frontier_figure(frontier: Frontier) -> Drawn:
     return Drawn(
         "frontier",
         "What a change of the share is worth",
-        f"{frontier.cycle}, friction {frontier.friction:g}, idle drive none: saving over changes of the share by more "
-        "than 0.25, along the price of a change.",
+        f"{frontier.place}: saving over changes of the share by more than 0.25, along the price of a change.",
         figures.switching_frontier(families),
         FRONTIER,
     )

@@ -361,6 +361,10 @@ def stops_table(study: Study) -> TableOf:
     )
 
 
+def _policy_of_point(point: FrontierPoint) -> str:
+    return point.policy
+
+
 def frontier_table(study: Study) -> TableOf:
     """Saving against changes of the share."""
     frontier = study.frontier
@@ -369,10 +373,11 @@ def frontier_table(study: Study) -> TableOf:
         Column("Price of a change", lambda row: row.price),
         Column("Saving", lambda row: row.saving_percent, "%", 3),
         Column("Changes of the share", lambda row: row.share_changes_per_min, "1/min", 1),
+        *([Column("Policy", _policy_of_point)] if any(point.policy for point in frontier.points) else ()),
     )
     return TableOf(
         FRONTIER,
-        f"{frontier.cycle}, friction {frontier.friction:g}, idle drive none",
+        frontier.place,
         columns,
         [point for point in frontier.points if point.family != ED],
         "The price of instantaneous_slip is the power a change has to save; that of preview and ours is a cost per "

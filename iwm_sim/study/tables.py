@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from iwm_sim.study.report import Column
-from iwm_sim.study.rows import Row
+from iwm_sim.study.rows import Row, policy_text
 
 
 def _trace(row: Row) -> str:
@@ -20,11 +20,6 @@ def _saving(row: Row) -> float | str | None:
 def _possible(row: Row) -> float | None:
     """Part of the possible saving, %; nothing where the strategy saves nothing."""
     return 100.0 * row.share_of_possible if row.share_of_possible and row.share_of_possible > 0.0 else None
-
-
-def _policy(row: Row) -> str:
-    made = row.made_with
-    return f"{made['policy_grid']} {made['policy_checksum'][:8]}" if made.get("policy_checksum") else ""
 
 
 def _period(row: Row) -> float | None:
@@ -46,7 +41,7 @@ COLUMNS: tuple[Column[Row], ...] = (
     Column("locked s", lambda row: row.metrics.locked_s, decimals=2),
     Column("trace", _trace),
     Column("decides every s", _period, decimals=2),
-    Column("policy", _policy),
+    Column("policy", policy_text),
 )
 
 

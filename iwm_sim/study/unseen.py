@@ -9,13 +9,13 @@ counting changes; cells whose trace was lost count as such and have no margin.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from iwm_power_manager import __version__
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.mdp.demand import chain_of, source_of
 from iwm_power_manager.policy import load_policy
@@ -89,7 +89,7 @@ def drive_cell(cell: Cell) -> Frontier:
     """The rivals, and ours at the default budget, on one cell."""
     place = place_of(cell)
     policy = load_policy(PolicySource("policies", DEFAULT_GRID).find(place.vehicle, cell.friction))
-    return measure_frontier(place, [(policy.problem.changes_per_min, policy.table())])
+    return measure_frontier(place, [policy])
 
 
 def budgets_of(place: Place, budgets: Sequence[float], folder: Path) -> Frontier:
@@ -100,7 +100,7 @@ def budgets_of(place: Place, budgets: Sequence[float], folder: Path) -> Frontier
         sources = [source_of(load_cycle(resolve(name)), problem, place.vehicle.params) for name in TRAINING_CYCLES]
         chain = chain_of(problem, sources)
         made = solve_one(problem, place.vehicle, place.friction, chain, sources, folder / f"{budget:g}.npz")
-        policies.append((budget, made.policy.table()))
+        policies.append(made.policy)
     return measure_frontier(place, policies, bounds=True)
 
 
@@ -154,13 +154,15 @@ def report(frontiers: Sequence[Frontier], worst: int = 10) -> str:
     return "\n".join(lines)
 
 
-def to_json(frontiers: Sequence[Frontier]) -> bytes:
-    """Everything measured."""
-    content: dict[str, Any] = {
+def to_json(frontiers: Sequence[Frontier]) -> dict[str, Any]:
+    """Everything measured, as plain values."""
+    return {
+        "package_version": __version__,
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in judge(frontiers)],
         "cells": [
             {
                 "label": f.label,
+                "made_with": f.made_with,
                 "rivals": [point._asdict() for point in f.rivals],
                 "ours": [point._asdict() for point in f.ours],
                 "bounds": [point._asdict() for point in f.bounds],
@@ -168,4 +170,3 @@ def to_json(frontiers: Sequence[Frontier]) -> bytes:
             for f in frontiers
         ],
     }
-    return (json.dumps(content, indent=1, allow_nan=False) + "\n").encode()

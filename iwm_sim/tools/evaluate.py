@@ -52,7 +52,7 @@ examples:
   The battery's resistance as the paper estimates it (eq. 25), with the comparison plot:
     evaluate --fit-battery --plot battery.svg
 
-  Every table and figure of the paper, and what beats them (10 min on two cores):
+  Every table and figure of the paper, and what beats them (3 min on two cores):
     evaluate --study runs/study
 
 Vehicles, cycles and grids that come with the package are found by name. Results go to stdout, progress to stderr. An
@@ -71,7 +71,8 @@ MODES = {
     "paper": _COMMON | {"--paper", "--cycle", "--idle-drive", "--json"},
     "figure": _COMMON | {"--figure", "--plot"},
     "ablation": _COMMON | {"--ablation", "--json"},
-    "frontier": {"--frontier", "--vehicle", "--idle-drive", "--cycle", "--friction", "--budgets", "--quiet"},
+    "frontier": {"--frontier", "--vehicle", "--idle-drive", "--cycle", "--friction", "--budgets"}
+    | {"--json", "--quiet"},
     "unseen": {"--unseen", "--vehicle", "--idle-drive", "--seeds", "--cycles", "--cars", "--jobs", "--quiet"},
     "scenario": {"--scenario", "--strategy", "--idle-drive", "--json", "--quiet"},
     "fit_battery": {"--fit-battery", "--vehicle", "--quiet", "--plot", "--json", "--cycle", "--friction"}

@@ -318,15 +318,22 @@ def _frontier(options: argparse.Namespace) -> None:
         for name in options.cycle:
             cycle = cases.cycle_of(name)
             for friction in options.friction or [0.9]:
-                label = f"{vehicle.name}, idle drive {vehicle.idle_drive}, {cycle.name}, friction {friction:g}"
-                place = frontier.Place(label, vehicle, cycle, friction)
+                place = frontier.Place(f"{vehicle.name} on {cycle.name}", vehicle, cycle, friction)
                 with tempfile.TemporaryDirectory() as policies:
                     found.append(unseen.budgets_of(place, options.budgets or frontier.BUDGETS_PER_MIN, Path(policies)))
                 picture = folder / f"{vehicle.name}_{vehicle.idle_drive}_{cycle.name}_{round(friction * 100):03d}.svg"
                 frontier_figure.draw_frontier(found[-1], picture)
                 if not options.quiet:
-                    print(f"{label}: {picture}")
-    atomic_write(folder / "frontier.json", unseen.to_json(found))
+                    _show_frontier(found[-1], picture)
+    for path in filter(None, (folder / "frontier.json", options.json)):
+        write_json(path, unseen.to_json(found))
+
+
+def _show_frontier(made: frontier.Frontier, picture: Path) -> None:
+    points = [*made.rivals, *made.ours, *made.bounds]
+    print(f"{made.label}, {made.made_with}\n{plain_table(points, frontier.POINT_COLUMNS)}")
+    print("moves/min: sum of all moves, 1 being all the power; preview: the bound, the whole drive known in advance")
+    print(f"picture: {picture}\n")
 
 
 def _unseen(options: argparse.Namespace) -> None:
@@ -340,7 +347,7 @@ def _unseen(options: argparse.Namespace) -> None:
     say(f"{len(wanted)} cells from seed {options.seeds} on; policies for cars of their own are solved first")
     with progress_of(len(wanted), "cell", options.quiet) as bar:
         made = on_all_cores(unseen.drive_cell, wanted, options.jobs, lambda _: bar.update())
-    atomic_write(folder / "unseen.json", unseen.to_json(made))
+    write_json(folder / "unseen.json", unseen.to_json(made))
     frontier_figure.draw_margins(made, folder / "margins.svg")
     text = unseen.report(made)
     atomic_write(folder / "unseen.txt", (text + "\n").encode())

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
@@ -16,6 +14,9 @@ from iwm_sim.study import frontier, unseen
 from iwm_sim.study.frontier import COUNTS, Frontier, Place, Point
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), "drag")
+
+
+MADE = "friction 0.9, idle drive drag, control at 100 Hz, split decided every 0.02 s"
 
 
 def point(saving, changes, fine=None, travel=None, held=True, strategy="instantaneous_slip"):
@@ -43,15 +44,15 @@ def test_the_busiest_minute_counts_changes_by_more_than_a_quarter():
 
 
 def test_a_verdict_needs_nearly_all_cells_close_none_far_below_and_the_mean_above():
-    good = [Frontier(str(k), (point(0.3, 5.0),), (point(0.35, 5.0),), ()) for k in range(19)]
-    near = Frontier("near", (point(0.3, 5.0),), (point(0.28, 5.0),), ())
-    far = Frontier("far", (point(0.3, 5.0),), (point(0.2, 5.0),), ())
+    good = [Frontier(str(k), MADE, (point(0.3, 5.0),), (point(0.35, 5.0),), ()) for k in range(19)]
+    near = Frontier("near", MADE, (point(0.3, 5.0),), (point(0.28, 5.0),), ())
+    far = Frontier("far", MADE, (point(0.3, 5.0),), (point(0.2, 5.0),), ())
     assert all(verdict.reached for verdict in unseen.judge([*good, near]))
     assert not any(verdict.reached for verdict in unseen.judge([*good, far]))
     assert not any(verdict.reached for verdict in unseen.judge([*good, near, near]))
     text = unseen.report([*good, far])
     assert "NOT reached" in text and text.index("far") > text.index("worst cells")
-    assert {row["counted"] for row in json.loads(unseen.to_json([far]))["verdicts"]} == set(COUNTS)
+    assert {row["counted"] for row in unseen.to_json([far])["verdicts"]} == set(COUNTS)
 
 
 def test_cells_are_drawn_from_seeds_with_and_without_noise():
@@ -66,10 +67,12 @@ def test_cells_are_drawn_from_seeds_with_and_without_noise():
 def test_the_bound_is_never_below_what_a_strategy_reached_with_no_more_changes():
     speed = np.concatenate([np.linspace(0.0, 12.0, 10), np.full(12, 12.0), np.linspace(12.0, 0.0, 8), np.zeros(3)])
     place = Place("short", CAR, make_cycle("short", np.arange(speed.size, dtype=float), speed), 0.9)
-    table = load_policy(share_path("policies/jalalmaab_2015_drag_coupled_mu090.npz")).table()
-    found = frontier.measure_frontier(place, [(8.0, table)], thresholds_w=(0.0, 60.0), bounds=True)
+    policy = load_policy(share_path("policies/jalalmaab_2015_drag_coupled_mu090.npz"))
+    found = frontier.measure_frontier(place, [policy], thresholds_w=(0.0, 60.0), bounds=True)
     (ours,), (bound,) = found.ours, found.bounds
     assert ours.held and bound.saving_percent >= ours.saving_percent > 0.0
     within = [p for p in found.rivals if p.changes_per_min <= ours.changes_per_min]
     assert all(bound.saving_percent >= p.saving_percent for p in within)
     assert len(found.rivals) == 3
+    assert found.made_with == MADE
+    assert ours.policy == f"coupled {policy.checksum[:8]}" and ours.setting == policy.problem.changes_per_min

@@ -12,8 +12,9 @@ import pytest
 
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
-from iwm_sim.study import variants
+from iwm_sim.study import unseen, variants
 from iwm_sim.study.content import Study
+from iwm_sim.study.frontier import Frontier, Point
 from iwm_sim.tools import evaluate
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -257,3 +258,22 @@ def test_scenarios_are_driven_with_each_strategy_and_say_what_they_require(tmp_p
 def test_a_strategy_that_knows_the_future_drives_no_scenario(capsys):
     assert evaluate.main(["--scenario", "split_stop", "--strategy", "preview"]) == 2
     assert "preview drives no scenario" in capsys.readouterr().err
+
+
+def test_a_frontier_is_printed_drawn_and_written_with_what_it_was_made_with(hill, tmp_path, monkeypatch, capsys):
+    rival = Point("instantaneous_slip", 60.0, 0.41, 5.5, 6.5, 4.4, 7, True)
+    ours = Point("sdp_lookahead", 8.0, 0.47, 5.2, 6.1, 4.3, 7, True, "coupled 12345678")
+    made_with = "friction 0.9, idle drive drag, control at 100 Hz, split decided every 0.02 s"
+    monkeypatch.setattr(unseen, "budgets_of", lambda place, *_: Frontier(place.label, made_with, (rival,), (ours,), ()))
+    out = tmp_path / "out.json"
+    assert evaluate.main(["--frontier", str(tmp_path), "--cycle", str(hill), "--json", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert f"jalalmaab_2015 on hill, {made_with}" in shown
+    assert [line.split() for line in shown.splitlines() if line.startswith(("instantaneous_slip ", "sdp_look"))] == [
+        ["instantaneous_slip", "60", "W", "5.5", "6.5", "4.4", "7", "0.410", "held"],
+        ["sdp_lookahead", "8", "changes/min", "5.2", "6.1", "4.3", "7", "0.470", "held", "coupled", "12345678"],
+    ]
+    (cell,) = json.loads(out.read_text())["cells"]
+    assert cell["made_with"] == made_with and cell["ours"][0]["policy"] == "coupled 12345678"
+    picture = next(tmp_path.glob("*.svg")).read_text()
+    assert made_with in picture and "coupled 12345678" in picture
