@@ -69,13 +69,7 @@ _OCV_KEYS = ("ocv_soc", "ocv_cell_v")
 _LOSS_FIELDS = dict(
     zip(
         TABLE["loss"],
-        (
-            "loss_constant_w",
-            "loss_linear_speed",
-            "loss_quadratic_speed",
-            "loss_linear_torque",
-            "loss_quadratic_torque",
-        ),
+        ("loss_constant_w", "loss_linear_speed", "loss_quadratic_speed", "loss_linear_torque", "loss_quadratic_torque"),
         strict=True,
     )
 )

@@ -39,12 +39,7 @@ class Child:
     """
 
     def __init__(
-        self,
-        name: str,
-        command: Sequence[str],
-        environment: Mapping[str, str],
-        log: Path,
-        stdout: int | None = None,
+        self, name: str, command: Sequence[str], environment: Mapping[str, str], log: Path, stdout: int | None = None
     ) -> None:
         self.name = name
         self.log = log

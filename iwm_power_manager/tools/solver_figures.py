@@ -81,13 +81,7 @@ def draw_policy(axes: Axes, policy: Policy) -> None:
     previous = nearest(problem.previous_shares, 0.5)
     share = policy.front_share[:, :, front, rear, previous]
     image = axes.pcolormesh(
-        problem.power_w / 1000.0,
-        problem.speed_mps,
-        share.T,
-        vmin=0.0,
-        vmax=1.0,
-        shading="nearest",
-        cmap="coolwarm",
+        problem.power_w / 1000.0, problem.speed_mps, share.T, vmin=0.0, vmax=1.0, shading="nearest", cmap="coolwarm"
     )
     axes.figure.colorbar(image, ax=axes, label="front share")
     axes.set(

@@ -120,11 +120,7 @@ def soc_of_model(
 
 
 def fit(
-    vehicle: str,
-    idle_drive: str = "",
-    cycles: Sequence[str] = CYCLES,
-    friction: float = 0.9,
-    soc: float = 0.8,
+    vehicle: str, idle_drive: str = "", cycles: Sequence[str] = CYCLES, friction: float = 0.9, soc: float = 0.8
 ) -> Fit:
     """Drive the cycles with the plant and equal split, and fit the static circuit to it."""
     runs = {}

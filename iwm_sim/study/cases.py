@@ -13,7 +13,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -199,26 +199,39 @@ def drive(case: Case, until_s: float = np.inf) -> Run:
     ConfigError, PolicyError
         A file of it is wrong, or its policy was solved for another car.
     """
-    cycle = cycle_of(case.cycle)
     vehicle = vehicle_of(case.vehicle, case.idle_drive, case.car)
     settings = case.settings._replace(strategy=STRATEGIES[case.strategy].code)
     table_of = None
     if case.policies:
         table_of = functools.partial(PolicyBank(case.policies, case.rule, vehicle).table, settings.strategy)
-    return closed_loop.run(
-        cycle,
+    return _driven(
+        case,
         vehicle,
         settings,
         empty_table() if table_of else _policy_table(case, vehicle, until_s),
+        until_s,
+        noise=_noise(case.noise, cycle_of(case.cycle), case.dt_s),
+        plant_vehicle=vehicle_of(case.vehicle, case.idle_drive, case.car + case.plant) if case.plant else None,
+        table_of=table_of,
+    )
+
+
+def _driven(
+    case: Case, vehicle: Vehicle, settings: Settings, policy: PolicyTable, until_s: float, **others: Any
+) -> Run:
+    """A drive of a case's cycle on its road; `others` as in `closed_loop.run`."""
+    return closed_loop.run(
+        cycle_of(case.cycle),
+        vehicle,
+        settings,
+        policy,
         case.friction,
         assumed_friction=case.assumed_friction,
         dt_s=case.dt_s,
         substeps=case.substeps,
         soc=case.soc,
         until_s=until_s,
-        noise=_noise(case.noise, cycle, case.dt_s),
-        plant_vehicle=vehicle_of(case.vehicle, case.idle_drive, case.car + case.plant) if case.plant else None,
-        table_of=table_of,
+        **others,
     )
 
 
@@ -242,18 +255,8 @@ def _policy_table(case: Case, vehicle: Vehicle, until_s: float) -> PolicyTable:
 
 def known_in_advance(case: Case, vehicle: Vehicle, until_s: float = np.inf) -> tuple[Run, FloatArray]:
     """A drive of the cycle with equal split, and the best schedule for the demand it had (`preview`)."""
-    equal = closed_loop.run(
-        cycle_of(case.cycle),
-        vehicle,
-        case.settings._replace(strategy=STRATEGIES[REFERENCE].code),
-        empty_table(),
-        case.friction,
-        assumed_friction=case.assumed_friction,
-        dt_s=case.dt_s,
-        substeps=case.substeps,
-        soc=case.soc,
-        until_s=until_s,
-    )
+    law = case.settings._replace(strategy=STRATEGIES[REFERENCE].code)
+    equal = _driven(case, vehicle, law, empty_table(), until_s)
     share = empty_table().share
     cost = preview.step_costs(
         equal["power_demand_w"],

@@ -167,9 +167,7 @@ def _panels(driven: Driven, reference: Driven, critical_slip: float) -> list[Pan
     run = driven.run
     panels = [
         Panel(
-            "Speed",
-            "m/s",
-            [Series("cycle", run["trace_mps"], OCHRE, wide=True), Series("car", run["speed_mps"], BLUE)],
+            "Speed", "m/s", [Series("cycle", run["trace_mps"], OCHRE, wide=True), Series("car", run["speed_mps"], BLUE)]
         ),
         Panel(
             "Power",

@@ -29,10 +29,7 @@ _WARM_UP_S = 0.1
 
 
 def on_all_cores(
-    function: Callable[[Item], Made],
-    items: Sequence[Item],
-    jobs: int,
-    done: Callable[[Made], object] = lambda _: None,
+    function: Callable[[Item], Made], items: Sequence[Item], jobs: int, done: Callable[[Made], object] = lambda _: None
 ) -> list[Made]:
     """`[function(item) for item in items]`, on `jobs` processes; `done` hears of each as it is ready.
 

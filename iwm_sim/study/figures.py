@@ -73,32 +73,18 @@ class Curve(NamedTuple):
     delta_soc_percent: ArrayLike
 
 
-class SplitRun(NamedTuple):
-    """Axle powers of one strategy.
-
-    Attributes
-    ----------
-    label : name of the strategy
-    front_power_w, rear_power_w : (N,)
-    """
-
-    label: str
-    front_power_w: ArrayLike
-    rear_power_w: ArrayLike
-
-
-class SlipRun(NamedTuple):
-    """Axle slips of one run.
+class AxleRun(NamedTuple):
+    """What both axles did in one run: powers in W, or slips.
 
     Attributes
     ----------
     label : name of the run
-    front_slip, rear_slip : (N,)
+    front, rear : (N,)
     """
 
     label: str
-    front_slip: ArrayLike
-    rear_slip: ArrayLike
+    front: ArrayLike
+    rear: ArrayLike
 
 
 def _styled[**P](build: Callable[P, Figure]) -> Callable[P, Figure]:
@@ -186,10 +172,7 @@ def policy_convergence(policy_change: ArrayLike, bellman_residual: ArrayLike | N
 
 @_styled
 def fitted_rule(
-    power_demand_w: ArrayLike,
-    front_power_w: ArrayLike,
-    rule_demand_w: ArrayLike,
-    rule_front_power_w: ArrayLike,
+    power_demand_w: ArrayLike, front_power_w: ArrayLike, rule_demand_w: ArrayLike, rule_front_power_w: ArrayLike
 ) -> Figure:
     """Fig. 13: what dynamic programming chose, (N,) points, and the rule fitted to it, (M,) points of a line."""
     figure, (axis,) = _axes(1, height_in=3.6)
@@ -221,51 +204,48 @@ def fitted_rule(
 
 
 @_styled
-def axle_powers(time_s: ArrayLike, runs: Sequence[SplitRun], window_s: tuple[float, float]) -> Figure:
+def axle_powers(time_s: ArrayLike, runs: Sequence[AxleRun], window_s: tuple[float, float]) -> Figure:
     """Fig. 14: front and rear power of strategies inside a window of time, s."""
-    figure, axes = _axes(2, height_in=4.6)
-    inside = _inside(time_s, window_s)
-    time = np.asarray(time_s, dtype=np.float64)[inside]
-    for index, run in enumerate(runs):
-        for axis, power in zip(axes, (run.front_power_w, run.rear_power_w), strict=True):
-            axis.plot(
-                time,
-                np.asarray(power, dtype=np.float64)[inside] / 1000.0,
-                color=COLOURS[index % 6],
-                linewidth=1.3,
-                label=run.label,
-            )
+    in_kw = [AxleRun(run.label, np.asarray(run.front) / 1000.0, np.asarray(run.rear) / 1000.0) for run in runs]
+    figure, axes = _by_axle(time_s, in_kw, window_s, 4.6, COLOURS[:6], 1.3)
     axes[0].set_ylabel("Front power, kW")
     axes[1].set_ylabel("Rear power, kW")
     axes[0].legend(ncols=len(runs))
-    _time_axis(axes[1], time)
     return figure
 
 
 @_styled
 def slips(
-    time_s: ArrayLike, runs: Sequence[SlipRun], critical_slip: float, window_s: tuple[float, float] | None = None
+    time_s: ArrayLike, runs: Sequence[AxleRun], critical_slip: float, window_s: tuple[float, float] | None = None
 ) -> Figure:
     """Fig. 15: slip of the front (a) and rear (b) axle, with the critical slip marked on both sides."""
-    figure, axes = _axes(2, height_in=4.8)
-    inside = _inside(time_s, window_s)
-    time = np.asarray(time_s, dtype=np.float64)[inside]
-    for index, run in enumerate(runs):
-        for axis, slip in zip(axes, (run.front_slip, run.rear_slip), strict=True):
-            axis.plot(
-                time,
-                np.asarray(slip, dtype=np.float64)[inside],
-                color=(VERMILION, BLUE, GREEN)[index % 3],
-                linewidth=1.2,
-                label=run.label,
-            )
+    figure, axes = _by_axle(time_s, runs, window_s, 4.8, (VERMILION, BLUE, GREEN), 1.2)
     for axis, label in zip(axes, ("(a) Front slip", "(b) Rear slip"), strict=True):
         for level in (-critical_slip, critical_slip):
             axis.axhline(level, color=GREY, linestyle=":", linewidth=1.0)
         axis.set_ylabel(label)
     axes[0].legend(loc="lower left", ncols=len(runs))
-    _time_axis(axes[1], time)
     return figure
+
+
+def _by_axle(
+    time_s: ArrayLike,
+    runs: Sequence[AxleRun],
+    window_s: tuple[float, float] | None,
+    height_in: float,
+    colours: Sequence[str],
+    width: float,
+) -> tuple[Figure, list[Axes]]:
+    """Front above rear, a line for each run."""
+    figure, axes = _axes(2, height_in=height_in)
+    inside = _inside(time_s, window_s)
+    time = np.asarray(time_s, dtype=np.float64)[inside]
+    for index, run in enumerate(runs):
+        for axis, values in zip(axes, (run.front, run.rear), strict=True):
+            shown = np.asarray(values, dtype=np.float64)[inside]
+            axis.plot(time, shown, color=colours[index % len(colours)], linewidth=width, label=run.label)
+    _time_axis(axes[1], time)
+    return figure, axes
 
 
 @_styled

@@ -117,11 +117,7 @@ def _all_stops(wanted: Sequence[skid.Stop]) -> list[skid.Stopped]:
 
 def _warming(policies: Policies, cycle: str) -> list[Case]:
     base = Case(cycle, policies.vehicle, *keys()[0], "equal")
-    return [
-        base,
-        replace(base, strategy=STRATEGY, policy=policies.ours(*keys()[0])),
-        replace(base, strategy="preview"),
-    ]
+    return [base, replace(base, strategy=STRATEGY, policy=policies.ours(*keys()[0])), replace(base, strategy="preview")]
 
 
 def _fit_cycles(cycles: Sequence[str]) -> tuple[str, ...]:

@@ -154,10 +154,10 @@ def window_figures(window: dict[str, dict[str, FloatArray]]) -> list[Drawn]:
     time_s = ed["time_s"]
     span = (float(time_s[0]), float(time_s[-1]))
     powers = [
-        figures.SplitRun(name, run["front_power_w"], run["rear_power_w"]) for name, run in (("ED", ed), ("ours", ours))
+        figures.AxleRun(name, run["front_power_w"], run["rear_power_w"]) for name, run in (("ED", ed), ("ours", ours))
     ]
     slips = [
-        figures.SlipRun(name, run["front_slip"], run["rear_slip"])
+        figures.AxleRun(name, run["front_slip"], run["rear_slip"])
         for name, run in (("without", without), ("ours", ours))
     ]
     return [

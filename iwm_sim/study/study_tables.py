@@ -284,14 +284,7 @@ def table_6(rows: Sequence[Row]) -> Iterator[TableOf]:
 
 def ablation_table(study: Study) -> TableOf:
     """What each choice of the paper's program costs."""
-    return TableOf(
-        PROGRAM,
-        "",
-        ablation.columns(study.ablation),
-        study.ablation,
-        ABLATION_NOTE,
-        "evaluate --ablation",
-    )
+    return TableOf(PROGRAM, "", ablation.columns(study.ablation), study.ablation, ABLATION_NOTE, "evaluate --ablation")
 
 
 def _percent(part: float | None) -> float | None:

@@ -162,11 +162,7 @@ def _add_law(group: argparse._ArgumentGroup) -> None:
 
 def _add_simulation(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
-        "--dt",
-        type=number(1e-4, MAX_DT_S),
-        default=0.01,
-        metavar="S",
-        help="control step (default: %(default)s)",
+        "--dt", type=number(1e-4, MAX_DT_S), default=0.01, metavar="S", help="control step (default: %(default)s)"
     )
     group.add_argument("--substeps", type=whole(1, 100), default=1, metavar="N", help="plant steps in it")
     group.add_argument(
@@ -186,11 +182,7 @@ def _add_simulation(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument("--seed", type=whole(0, 2**32 - 1), default=1, metavar="N", help="of the noise")
     group.add_argument(
-        "--jobs",
-        type=whole(1, 1024),
-        default=cores(),
-        metavar="N",
-        help="processes (default: one for each core)",
+        "--jobs", type=whole(1, 1024), default=cores(), metavar="N", help="processes (default: one for each core)"
     )
 
 
@@ -212,9 +204,7 @@ def _add_modes(parent: argparse._ArgumentGroup) -> None:
         "--scenario", **several, metavar="NAME", help="real roads: files, or names of config/scenarios (see make roads)"
     )
     group.add_argument(
-        "--frontier",
-        metavar="DIR",
-        help="saving against changes: ours over budgets, its rival over thresholds",
+        "--frontier", metavar="DIR", help="saving against changes: ours over budgets, its rival over thresholds"
     )
     group.add_argument(
         "--unseen", metavar="DIR", help="the same at the default budget, on cycles and cars drawn from seeds"

@@ -22,17 +22,7 @@ from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.road_report import text as road_text
 from iwm_sim.road_run import check_scenario
 from iwm_sim.scenario import load_scenario
-from iwm_sim.study import (
-    ablation,
-    battery_fit,
-    cases,
-    frontier,
-    frontier_figure,
-    paper,
-    reproduce,
-    single,
-    unseen,
-)
+from iwm_sim.study import ablation, battery_fit, cases, frontier, frontier_figure, paper, reproduce, single, unseen
 from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result, SensorNoise
 from iwm_sim.study.driving import Progress, drive_all, on_all_cores, progress_of, silent, tell, warm_up, with_rules
 from iwm_sim.study.names import REFERENCE
@@ -91,7 +81,7 @@ def _doubts(wanted: Sequence[Case]) -> list[str]:
 def planned(options: argparse.Namespace, say: Callable[[str], None]) -> list[Case]:
     """The cases of a command line, each checked, with their policies found or solved. Equal split is always there."""
     if options.save_series:
-        _make_folder(options.save_series)
+        _folder(options.save_series)
     strategies = list(dict.fromkeys([REFERENCE, *(options.strategy or [DEFAULT_STRATEGY])]))
     settings = _settings(options)
     result: list[tuple[str, Case]] = []
@@ -196,11 +186,13 @@ def remarks(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def _make_folder(path: str) -> None:
+def _folder(path: str) -> Path:
+    folder = Path(path)
     try:
-        Path(path).mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(path, "", f"cannot be created: {error.strerror}", "a folder") from None
+    return folder
 
 
 # --- instead of cases -----------------------------------------------------------------------------------------------
@@ -354,15 +346,6 @@ def _unseen(options: argparse.Namespace) -> None:
     if not options.quiet:
         took_min = (time.perf_counter() - started) / 60.0
         print(f"{text}\nin {took_min:.0f} min: {folder}/unseen.json, margins.svg, unseen.txt")
-
-
-def _folder(path: str) -> Path:
-    folder = Path(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError("arguments", str(path), f"{error.strerror}", "a folder") from None
-    return folder
 
 
 _RUN = {

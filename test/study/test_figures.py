@@ -20,8 +20,8 @@ def built():
         "fig10": f.depletion_over_split_panels([("(a) 1 kW", [BOWL]), ("(b) 5 kW", [BOWL])]),
         "fig12": f.policy_convergence([300.0, 20.0, 0.0], [1.0, 1e-3, 1e-9]),
         "fig13": f.fitted_rule(1e3 * WAVE, 600.0 * WAVE, [-1e3, 1e3], [-600.0, 600.0]),
-        "fig14": f.axle_powers(TIME, [f.SplitRun("sdp", 1e3 * WAVE, 2e3 * WAVE)], (20.0, 40.0)),
-        "fig15": f.slips(TIME, [f.SlipRun("with", WAVE, WAVE), f.SlipRun("without", WAVE, WAVE)], 0.2),
+        "fig14": f.axle_powers(TIME, [f.AxleRun("sdp", 1e3 * WAVE, 2e3 * WAVE)], (20.0, 40.0)),
+        "fig15": f.slips(TIME, [f.AxleRun("with", WAVE, WAVE), f.AxleRun("without", WAVE, WAVE)], 0.2),
         "transitions": f.transition_matrix(np.array([[0.9, 0.1], [0.0, 1.0]]), [0.0, 1e3]),
         "frontier": f.switching_frontier({"ours": ([4.0, 6.0], [2.3, 2.45]), "preview": ([0.0, 7.0], [0.0, 2.47])}),
     }
@@ -74,7 +74,7 @@ def test_powers_are_drawn_in_kilowatts_inside_the_window(figures):
 
 def test_a_window_outside_the_drive_is_refused():
     with pytest.raises(ValueError, match="no sample between"):
-        f.axle_powers(TIME, [f.SplitRun("sdp", WAVE, WAVE)], (500.0, 600.0))
+        f.axle_powers(TIME, [f.AxleRun("sdp", WAVE, WAVE)], (500.0, 600.0))
 
 
 def test_the_last_policy_iteration_may_change_nothing(figures):

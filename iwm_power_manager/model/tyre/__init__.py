@@ -44,10 +44,7 @@ class TyreModel(NamedTuple):
     ranges: dict[str, tuple[float, float]]
 
 
-MODELS = {
-    "magic_formula": TyreModel(_MAGIC_FORMULA, magic_formula.RANGES),
-    "fiala": TyreModel(_FIALA, fiala.RANGES),
-}
+MODELS = {"magic_formula": TyreModel(_MAGIC_FORMULA, magic_formula.RANGES), "fiala": TyreModel(_FIALA, fiala.RANGES)}
 
 
 def make(name: str, values: Mapping[str, float], slip_speed_floor_mps: float) -> Tyre:
