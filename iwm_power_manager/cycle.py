@@ -9,7 +9,6 @@ probably holds; `import_cycle` makes a cycle of a log in other units, with gaps 
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import math
 from dataclasses import dataclass
@@ -21,7 +20,8 @@ from numpy.typing import NDArray
 
 from iwm_power_manager import trace_units
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import MAX_LINE_LENGTH, read_text, sha256_of, to_number
+from iwm_power_manager.files import sha256_of
+from iwm_power_manager.tables import read_table
 
 MAX_SPEED_MPS = 70.0
 MAX_GRADE = 0.5
@@ -119,31 +119,21 @@ def load_cycle(path: Path | str) -> Cycle:
         a value that is no number, not finite or out of range, or a time that does not increase. The message names
         the line.
     """
-    lines = [
-        (number, line)
-        for number, line in enumerate(read_text(path).splitlines(), 1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not lines:
-        raise ConfigError(path, "", "is empty", "a header line time_s,speed_mps[,grade] and two rows or more")
-    header = _header(path, *lines[0])
-    if len(lines) - 1 > MAX_SAMPLES:
-        raise ConfigError(path, "", f"has {len(lines) - 1} rows", f"<= {MAX_SAMPLES}")
-    values = np.empty((len(lines) - 1, len(header)))
-    for row, (number, line) in enumerate(lines[1:]):
-        fields = _fields(path, number, line)
+    table = read_table(path, "comma", "point")
+    (first, names), *rows = table.rows
+    header = _header(path, first, names)
+    if len(rows) > MAX_SAMPLES:
+        raise ConfigError(path, "", f"has {len(rows)} rows", f"<= {MAX_SAMPLES}")
+    values = np.empty((len(rows), len(header)))
+    for row, (number, fields) in enumerate(rows):
         if len(fields) != len(header):
             hint = ": decimal commas? import_cycle reads them" if len(fields) == 2 * len(header) else ""
             problem = f"has {len(fields)} values{hint}"
             raise ConfigError(path, f"line {number}", problem, f"{len(header)}, as in the header")
-        for column, field in enumerate(fields):
-            try:
-                values[row, column] = to_number(field)
-            except ValueError as error:
-                raise ConfigError(path, f"line {number}", f"{header[column]} {error}") from None
+        values[row] = [table.number(number, field, name) for name, field in zip(header, fields, strict=True)]
     columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(header)}
     columns.setdefault("grade", np.zeros(len(values)))
-    places = [f"line {number}" for number, _ in lines[1:]]
+    places = [f"line {number}" for number, _ in rows]
     columns["speed_mps"] = at_rest(columns["speed_mps"])
     _check_rows(path, places, columns)
     found = trace_units.implausible(columns["time_s"], columns["speed_mps"])
@@ -165,12 +155,11 @@ def at_rest(speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where((speed_mps < 0.0) & (speed_mps >= -REST_NOISE_MPS), 0.0, speed_mps)
 
 
-def _header(path: Path | str, number: int, line: str) -> list[str]:
+def _header(path: Path | str, number: int, header: list[str]) -> list[str]:
     allowed = "time_s,speed_mps[,grade]"
-    header = [name.strip() for name in _fields(path, number, line)]
     where = f"line {number}"
-    if len(header) == 1 and any(mark in line for mark in ";\t|"):
-        mark = next(mark for mark in ";\t|" if mark in line)
+    mark = next((mark for mark in ";\t|" if len(header) == 1 and mark in header[0]), "")
+    if mark:
         problem = f"is separated by {'tabs' if mark == chr(9) else repr(mark)}: import_cycle reads that"
         raise ConfigError(path, where, problem, allowed)
     for name in _REQUIRED:
@@ -181,15 +170,6 @@ def _header(path: Path | str, number: int, line: str) -> list[str]:
             problem = "stands twice" if header.count(name) > 1 else "is unknown"
             raise ConfigError(path, where, f"column '{name}' {problem}", allowed)
     return header
-
-
-def _fields(path: Path | str, number: int, line: str) -> list[str]:
-    if len(line) > MAX_LINE_LENGTH:
-        raise ConfigError(path, f"line {number}", f"has {len(line)} characters", f"<= {MAX_LINE_LENGTH}")
-    try:
-        return next(csv.reader([line], strict=True))
-    except csv.Error as error:
-        raise ConfigError(path, f"line {number}", f"is no CSV: {error}") from None
 
 
 def _check_rows(path: Path | str, places: list[str], columns: dict[str, NDArray[np.float64]]) -> None:

@@ -8,7 +8,6 @@ from a loss polynomial fitted to the map.
 
 from __future__ import annotations
 
-import csv
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +17,7 @@ import numpy as np
 from iwm_power_manager import files
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.parameters import FloatArray
+from iwm_power_manager.tables import read_table
 
 COLUMNS = ("speed_rad_s", "torque_nm", "efficiency")
 RANGES = {"speed_rad_s": (0.0, 20_000.0), "torque_nm": (-20e3, 20e3), "efficiency": (0.0, 1.0)}
@@ -88,23 +88,17 @@ def read_map(path: Path | str) -> MotorMap:
     limits (`missing` checks that).
     """
     points: dict[tuple[float, float], float] = {}
-    reader = csv.reader(files.read_text(path).splitlines())
-    line = 1
-    try:
-        header = [cell.strip() for cell in next(reader, [])]
-        if tuple(header) != COLUMNS:
-            hint = "" if ";" not in (header or [""])[0] else ": separated by ';'? import_motor reads that"
-            raise ConfigError(path, "line 1", f"{','.join(header)!r} is no header{hint}", ",".join(COLUMNS))
-        for line, cells in enumerate(reader, start=2):
-            if any(cell.strip() for cell in cells):
-                speed, torque, efficiency = _point(path, line, cells)
-                if (speed, torque) in points:
-                    raise ConfigError(path, f"line {line}", f"repeats speed {speed:g}, torque {torque:g}")
-                points[speed, torque] = efficiency
-                if len(points) > MAX_POINTS:
-                    raise ConfigError(path, f"line {line}", "is one point too many", f"{MAX_POINTS}")
-    except csv.Error as error:
-        raise ConfigError(path, f"line {line}", f"is no CSV: {error}") from None
+    (first, header), *rows = read_table(path, "comma", "point").rows
+    if tuple(header) != COLUMNS:
+        hint = ": separated by ';'? import_motor reads that" if ";" in header[0] else ""
+        raise ConfigError(path, f"line {first}", f"{','.join(header)!r} is no header{hint}", ",".join(COLUMNS))
+    for line, cells in rows:
+        speed, torque, efficiency = _point(path, line, cells)
+        if (speed, torque) in points:
+            raise ConfigError(path, f"line {line}", f"repeats speed {speed:g}, torque {torque:g}")
+        points[speed, torque] = efficiency
+        if len(points) > MAX_POINTS:
+            raise ConfigError(path, f"line {line}", "is one point too many", f"{MAX_POINTS}")
     return map_of(path, points)
 
 

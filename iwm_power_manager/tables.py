@@ -63,7 +63,7 @@ def read_table(path: Path | str, separator: str = "auto", decimal: str = "auto")
         if len(line) > MAX_LINE_LENGTH:
             raise ConfigError(path, f"line {number}", f"has {len(line)} characters", f"<= {MAX_LINE_LENGTH}")
         try:
-            cells = next(csv.reader([" ".join(line.split()) if mark == " " else line], delimiter=mark))
+            cells = next(csv.reader([" ".join(line.split()) if mark == " " else line], delimiter=mark, strict=True))
         except csv.Error as error:
             raise ConfigError(path, f"line {number}", f"is no table: {error}") from None
         if len(cells) > MAX_COLUMNS:

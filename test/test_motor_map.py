@@ -109,8 +109,8 @@ GOOD = ("10,20,0.8", "10,40,0.5", "50,20,0.9", "50,40,0.85")
         (GOOD[::2], "has 2 speeds and 1 torques; allowed: 2 or more of each"),
         ((), "has 0 speeds and 0 torques; allowed: 2 or more of each"),
         (("0,0,0", "0,20,0", "10,0,0", "10,-20,nan", "0,-20,0"), "has no point with speed and torque above zero"),
-        (("1" * 5000 + ",1,1",), "characters, more than 40"),
-        (("1," + "x" * 200_000 + ",1",), "is no CSV: field larger than field limit"),
+        (("1" * 400 + ",1,1",), "characters, more than 40"),
+        (("1," + "x" * 200_000 + ",1",), "line 2: has 200004 characters"),
         (("0,0,0", "0,20,0", "0,-20,0", "0,40,0"), "has 1 speeds"),
     ],
 )
@@ -123,7 +123,7 @@ def test_a_bad_row_is_named(tmp_path, rows, words):
 @pytest.mark.parametrize("header", ["", "speed,torque,efficiency", "torque_nm,speed_rad_s,efficiency"])
 def test_a_wrong_header_is_named(tmp_path, header):
     with pytest.raises(
-        ConfigError, match=r"map\.csv: line 1: .* is no header; allowed: speed_rad_s,torque_nm,efficiency"
+        ConfigError, match=r"map\.csv: line [12]: .* is no header; allowed: speed_rad_s,torque_nm,efficiency"
     ):
         load_efficiency_map(write(tmp_path, *GOOD, header=header))
 
@@ -133,7 +133,7 @@ def test_an_empty_or_absent_file_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"map\.csv: cannot be read"):
         load_efficiency_map(path)
     path.write_text("")
-    with pytest.raises(ConfigError, match=r"map\.csv: line 1: '' is no header"):
+    with pytest.raises(ConfigError, match=r"map\.csv: is empty"):
         load_efficiency_map(path)
 
 
