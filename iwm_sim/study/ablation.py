@@ -7,19 +7,16 @@ solved anew and driven. The single changes were named before any of them was dri
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from iwm_power_manager.files import atomic_write
-from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
 from iwm_power_manager.solve import load_grid
 from iwm_sim.study import cases, labels
 from iwm_sim.study.cases import Case
 from iwm_sim.study.driving import Progress, drive_all
-from iwm_sim.study.plan import STRATEGY, Policies, variant
+from iwm_sim.study.plan import STRATEGY, Policies, grid_file, variant
 from iwm_sim.study.policies import solved
 from iwm_sim.study.report import Column
 from iwm_sim.study.rows import Place, by_place, rows_of
@@ -137,12 +134,11 @@ def _changed(
 ) -> Case:
     """The paper's strategy with some steps taken, solved on a grid of its own."""
     paper_grid = VARIANTS[labels.PAPER_SDP].grid
-    settings: dict[str, Any] = load_grid(paper_grid, policies.car(base.idle_drive).params).settings()
+    settings: dict[str, Any] = {}
     for name in names:
         settings |= STEPS[name].settings
-    del settings["name"]
-    file = folder / f"{'_'.join(label.replace('-', ' ').split())}.yaml"  # JSON is YAML
-    atomic_write(file, json.dumps(settings | {"format": PROBLEM_FORMAT}).encode())
+    problem = load_grid(paper_grid, policies.car(base.idle_drive).params)
+    file = grid_file(folder, "_".join(label.replace("-", " ").split()), problem, settings)
     strategy = next((STEPS[name].strategy for name in names if STEPS[name].strategy), "")
     case = VARIANTS[labels.PAPER_SDP].case(base, label)
     if not strategy or len(names) > 1:

@@ -7,10 +7,12 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from iwm_power_manager.control.settings import GATE_MODES
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
+from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.study import cases, labels, paper, skid
 from iwm_sim.study.cases import Case, Change, Rule, SensorNoise
@@ -92,20 +94,26 @@ class Policies:
         made = {}
         for factor in FRONTIER_FACTORS:
             price = factor * max(problem.switching_fixed_cost_j, problem.switching_cost_j)
-            settings = problem.settings() | {
-                "format": PROBLEM_FORMAT,
+            settings = {
                 "switching_cost_j": factor * problem.switching_cost_j,
                 "switching_fixed_cost_j": factor * problem.switching_fixed_cost_j,
                 "changes_per_min": problem.changes_per_min / factor,
             }
-            del settings["name"]
-            grid = folder / f"price_{price:g}_j.yaml"  # JSON is YAML
-            atomic_write(grid, json.dumps(settings).encode())
+            grid = grid_file(folder, f"price_{price:g}_j", problem, settings)
             other = factor != 1.0
             made[price] = (
                 solved(self.car(IDLE_DRIVES[0]), FRONTIER_FRICTION, str(grid), self._say) if other else at_hand
             )
         return made
+
+
+def grid_file(folder: Path, name: str, problem: Problem, settings: Mapping[str, Any]) -> Path:
+    """A grid's file: that of a problem with some of its settings replaced."""
+    content = problem.settings() | {"format": PROBLEM_FORMAT, **settings}
+    del content["name"]
+    path = folder / f"{name}.yaml"  # JSON is YAML
+    atomic_write(path, json.dumps(content).encode())
+    return path
 
 
 @dataclass(frozen=True)
@@ -161,15 +169,7 @@ def cell(base: Case, policies: Policies, rule: tuple[float, ...], keep: tuple[st
     """All strategies in one cell of Tables 3 to 5, all under the law's normal settings."""
     key = (base.idle_drive, base.friction)
     policy = policies.ours(*key)
-    rivals = [
-        replace(
-            base,
-            strategy="instantaneous_slip",
-            label=f"{labels.INSTANTANEOUS_SLIP} {power:g} W",
-            settings=base.settings._replace(switching_power_w=power),
-        )
-        for power in RIVAL_SWITCHING_W
-    ]
+    rivals = [_rival(base, f"{labels.INSTANTANEOUS_SLIP} {power:g} W", power) for power in RIVAL_SWITCHING_W]
     return [
         replace(base, label=labels.ED, keep=keep),
         replace(base, strategy="rule", label=labels.GRDP, rule=rule),
@@ -180,6 +180,12 @@ def cell(base: Case, policies: Policies, rule: tuple[float, ...], keep: tuple[st
         replace(cases.priced_as(base, policy), strategy="preview", label=labels.BOUND),
         replace(base, strategy="preview", label=labels.FREE_BOUND),
     ]
+
+
+def _rival(base: Case, label: str, power_w: float) -> Case:
+    """The split of least battery power now, changed only where that saves so much."""
+    settings = base.settings._replace(switching_power_w=power_w)
+    return replace(base, strategy="instantaneous_slip", label=label, settings=settings)
 
 
 def variant(base: Case, name: str, policies: Policies) -> Case:
@@ -196,15 +202,7 @@ def gates(base: Case, policies: Policies, keep: tuple[str, ...] = ()) -> list[Ca
 
 def frontier(base: Case, priced: Mapping[float, str]) -> list[Case]:
     """Saving against share changes: what the price of a change does, for each strategy that has one."""
-    rival = [
-        replace(
-            base,
-            strategy="instantaneous_slip",
-            label=f"instantaneous_slip|{power:g} W",
-            settings=base.settings._replace(switching_power_w=power),
-        )
-        for power in FRONTIER_POWERS_W
-    ]
+    rival = [_rival(base, f"instantaneous_slip|{power:g} W", power) for power in FRONTIER_POWERS_W]
     bound = [
         replace(base, strategy="preview", label=f"preview|{cost:g} J", switching_cost_j=cost)
         for cost in FRONTIER_COSTS_J

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from iwm_power_manager.control import law
-from iwm_power_manager.control.settings import GATE_MODES, default_settings
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import initial_state
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
@@ -19,6 +19,7 @@ from iwm_power_manager.model.tyre import friction_coefficient, slip_ratio
 from iwm_sim import closed_loop, plant
 from iwm_sim.metrics import CRITICAL_SLIP, MOVING_MPS, longest_s
 from iwm_sim.study import cases
+from iwm_sim.study.variants import with_gate
 
 STOP_FROM_MPS = 25.0
 
@@ -90,9 +91,7 @@ def emergency_stop(stop: Stop) -> Stopped:
     """Make the stop and say what came of it."""
     vehicle = cases.vehicle_of(stop.vehicle, stop.idle_drive)
     params = vehicle.params
-    settings = default_settings(stop.strategy)._replace(gate_mode=GATE_MODES[stop.gate_mode])
-    if stop.gate_mode == "table2":
-        settings = settings._replace(gate_hysteresis=0.0, gate_driving=False)  # as printed
+    settings = with_gate(default_settings(stop.strategy), stop.gate_mode)
     table = cases.policy_of(stop.policy).table() if stop.policy else empty_table()
     road = plant.Surroundings((stop.friction,) * 4)
     car = plant.initial_plant(params, 0.8, stop.from_mps)

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
 PAPER_PERIOD_S = 0.1
 
 
+def with_gate(settings: Settings, gate_mode: str) -> Settings:
+    """Settings of the law with a skid avoidance by its name; `table2` is as printed."""
+    settings = settings._replace(gate_mode=GATE_MODES[gate_mode])
+    return settings._replace(gate_hysteresis=0.0, gate_driving=False) if gate_mode == "table2" else settings
+
+
 class Variant(NamedTuple):
     """A strategy with what belongs to it.
 
@@ -34,11 +40,7 @@ class Variant(NamedTuple):
     def settings(self, settings: Settings) -> Settings:
         """Settings of the law with this variant's in place."""
         settings = settings._replace(decision_period_s=PAPER_PERIOD_S)
-        if self.gate_mode:
-            settings = settings._replace(gate_mode=GATE_MODES[self.gate_mode])
-        if self.gate_mode == "table2":
-            settings = settings._replace(gate_hysteresis=0.0, gate_driving=False)  # as printed
-        return settings
+        return with_gate(settings, self.gate_mode) if self.gate_mode else settings
 
     def case(self, base: Case, name: str, policy: str = "") -> Case:
         """A case driven with this variant, under its name."""
