@@ -29,12 +29,13 @@ from pathlib import Path
 
 #: Workers, one-way latency in ms, and seconds of work in a batch (0: one place each).
 SETTINGS = ((1, 0, 2.0), (2, 0, 2.0), (2, 0, 0.0), (8, 50, 0.0), (8, 50, 2.0))
+HZ = 100
 FLEET = {
     "format": 1,
     "cars": [{"vehicle": "generated:1000..1004"}],
     "friction": [0.9, 0.5],
     "strategies": ["instantaneous"],
-    "dt_s": 0.1,
+    "dt_s": 1.0 / HZ,
 }
 #: What a batch may cost beside its work.
 ALLOWED = 0.01
@@ -201,6 +202,7 @@ def run(drives: int) -> dict:
         real[strategy] = time.process_time() - started
     return {
         "drives": 2 * len(plan.drives),
+        "hz": HZ,
         "cores": len(os.sched_getaffinity(0)),
         "processor": fingerprint()["processor"],
         "load": os.getloadavg()[2],
@@ -218,9 +220,10 @@ def text(found: dict) -> str:
     rows = found["settings"]
     each_ms = 1000.0 * found["serial_cpu_s"] / found["drives"]
     lines = [
-        f"{found['drives']} drives (drawn cars and cycles of 300 s, control at 10 Hz, {each_ms:.1f} ms of processor "
-        f"each) on {found['cores']} cores ({found['processor']}), which other work shared (load {found['load']:.0f} "
-        "over 15 minutes); every setting gave the rows of one process, bit for bit. `python benchmarks/fleet.py`:",
+        f"{found['drives']} drives (drawn cars and cycles of 300 s, control at {found['hz']} Hz, {each_ms:.1f} ms of "
+        f"processor each) on {found['cores']} cores ({found['processor']}), which other work shared (load "
+        f"{found['load']:.0f} over 15 minutes); every setting gave the rows of one process, bit for bit. "
+        "`python benchmarks/fleet.py`:",
         "",
         "| workers | network | batch | batches | drives per second of processor | scheduler and client, s of processor "
         "| worker beside its tasks, ms a batch | worker idle, ms a batch | of its time in tasks |",

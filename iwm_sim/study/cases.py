@@ -147,7 +147,7 @@ def drawn_seed(name: str) -> int | None:
     return int(seed) if kind == "generated" and seed.isdecimal() else None
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=64)
 def cycle_of(path: str) -> Cycle:
     """A cycle by file or short name, or drawn: `generated:SEED`."""
     seed = drawn_seed(path)
