@@ -27,6 +27,8 @@ MAX_SPEED_MPS = 70.0
 MAX_GRADE = 0.5
 #: Two days at 10 Hz: beyond that, the time column is not in seconds.
 MAX_SAMPLES = 2_000_000
+#: A drive that is longer is none: a date in the column, or another unit. It would be sampled a hundred times a second.
+MAX_DURATION_S = 100_000.0
 
 #: A sensor at rest shows as little as this below zero: rest.
 REST_NOISE_MPS = 0.05
@@ -104,7 +106,9 @@ def make_cycle(name: str, time_s, speed_mps, grade=None) -> Cycle:
     slope = np.zeros_like(time) if grade is None else np.ascontiguousarray(grade, dtype=np.float64)
     if not (time.ndim == 1 and time.shape == speed.shape == slope.shape):
         raise ConfigError(name, "", f"columns of different lengths: {time.shape}, {speed.shape}, {slope.shape}")
-    _check_rows(name, [f"sample {i}" for i in range(time.size)], {"time_s": time, "speed_mps": speed, "grade": slope})
+    places = [f"sample {i}" for i in range(time.size)]
+    _check_rows(name, places, {"time_s": time, "speed_mps": speed, "grade": slope})
+    _check_duration(name, places, time)
     digest = hashlib.sha256(time.tobytes() + speed.tobytes() + slope.tobytes()).hexdigest()
     return Cycle(name, time, speed, slope, digest)
 
@@ -140,6 +144,7 @@ def load_cycle(path: Path | str) -> Cycle:
     if found:
         at, words = found
         raise ConfigError(path, places[at] if at >= 0 else "", f"speed_mps {words}")
+    _check_duration(path, places, columns["time_s"])
     return Cycle(
         name=Path(path).stem,
         time_s=columns["time_s"],
@@ -192,6 +197,13 @@ def _check_rows(path: Path | str, places: list[str], columns: dict[str, NDArray[
         at = int(back[0]) + 1
         before = columns["time_s"][at - 1]
         raise ConfigError(path, places[at], f"time_s {columns['time_s'][at]:g} does not increase", f"> {before:g} s")
+
+
+def _check_duration(path: Path | str, places: list[str], time_s: NDArray[np.float64]) -> None:
+    late = np.flatnonzero(time_s - time_s[0] > MAX_DURATION_S)
+    if late.size:
+        problem = f"time_s {time_s[late[0]]:g} is more than {MAX_DURATION_S:g} s after the first"
+        raise ConfigError(path, places[late[0]], problem, "a drive in seconds")
 
 
 def _unit_hint(columns: dict[str, NDArray[np.float64]]) -> str:

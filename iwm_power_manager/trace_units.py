@@ -48,6 +48,10 @@ class Steepest(NamedTuple):
     fall_at: int
 
 
+#: A trace of more windows is no drive, whatever its unit.
+_MOST_WINDOWS = 1e7
+
+
 def steepest(time_s: FloatArray, speed_mps: FloatArray) -> Steepest:
     """The hardest acceleration and braking of a trace of two points or more, times rising."""
     span = time_s[-1] - time_s[0]
@@ -62,7 +66,10 @@ def steepest(time_s: FloatArray, speed_mps: FloatArray) -> Steepest:
 
 def liveliness(time_s: FloatArray, speed_mps: FloatArray) -> float:
     """How lively a trace is, by the bound of the regulation on real driving emissions; 0 for one that never gains."""
-    window = max(min(_WINDOW_S, time_s[-1] - time_s[0]), _SHORTEST_S)
+    span = time_s[-1] - time_s[0]
+    window = max(min(_WINDOW_S, span), _SHORTEST_S)
+    if span > _MOST_WINDOWS * window:
+        return 0.0
     start = np.arange(time_s[0], time_s[-1] - window, window)
     before, after = (np.interp(start + shift, time_s, speed_mps) for shift in (0.0, window))
     rate, speed = (after - before) / window, 0.5 * (before + after)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -137,7 +139,7 @@ def test_a_cycle_shorter_or_far_longer_than_the_step_is_refused():
     with pytest.raises(ConfigError, match="shorter than a step"):
         make_cycle("made", [0.0, 0.05], [0.0, 1.0]).resample(0.1)
     with pytest.raises(ConfigError, match="too long for steps"):
-        make_cycle("made", [0.0, 1e9], [0.0, 1.0]).resample(0.1)
+        make_cycle("made", [0.0, 9e4], [0.0, 1.0]).resample(0.01)
 
 
 # --- Units -----------------------------------------------------------------------------------------------------------
@@ -190,3 +192,11 @@ def test_hard_driving_slow_driving_and_noise_are_no_mistake(write):
 def test_noise_of_a_sensor_at_rest_is_rest(write):
     assert load_cycle(write("time_s,speed_mps\n0,-0.001\n1,1\n")).speed_mps.tolist() == [0.0, 1.0]
     assert make_cycle("made", [0, 1], [-0.05, 1.0]).speed_mps.tolist() == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("end", ["1.7e9", "1e12", "100002"])
+def test_a_drive_of_days_is_refused_before_it_is_sampled(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "date.csv"
+    path.write_text(f"time_s,speed_mps\n0,1\n1,2\n{end},1\n")
+    with pytest.raises(ConfigError, match=r"line 4: time_s .* s after the first; allowed: a drive in seconds"):
+        load_cycle(path)

@@ -218,6 +218,8 @@ def _source(file: Path, key: str, signal: str, entry: Any, *, wheels: bool = Fal
     unit = check_choice(file, dotted(key, "unit"), values["unit"], units)
     sign = signs(file, dotted(key, "sign"), values.get("sign", 1), wheels=wheels)
     factor = check_number(file, dotted(key, "factor"), values.get("factor", 1.0))
+    if factor == 0.0:
+        raise ConfigError(file, dotted(key, "factor"), "0 is not allowed", "a number that is not 0")
     return Source(
         key=key,
         topic=values["topic"],

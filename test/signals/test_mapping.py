@@ -65,6 +65,7 @@ def test_a_topic_without_slash_is_found_in_its_namespace_unless_there_are_two() 
         ),
         ("signals: {speed: {topic: 3, field: data, unit: m/s}}", "signals.speed.topic: 3 is no name"),
         ("signals: {speed: {topic: x, field: data, unit: m/s, factor: .nan}}", "signals.speed.factor"),
+        ("signals: {speed: {topic: x, field: data, unit: m/s, factor: 0}}", "signals.speed.factor"),
         ("signals: {speed: {topic: x, field: data, unit: m/s, names: [a, b, c, d]}}", "names"),
         ("signals: {wheel_speed: {topic: x, field: data, unit: rpm, names: [a, a, b, c]}}", "four different names"),
         ("signals: {wheel_speed: [{topic: x, field: data, unit: rpm}]}", "signals.wheel_speed: 1 sources"),
