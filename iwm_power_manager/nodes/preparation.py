@@ -7,6 +7,7 @@ and says what it does.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -103,7 +104,8 @@ def _interface(
 ) -> tuple[dict[str, TopicReader], dict[str, CommandWriter]]:
     mapping.check_live()
     monitor = controller.monitor
-    assembly = Assembly(tuple(values["wheel_names"]), vehicle.params, lambda: monitor.speed_mps)
+    silent_s = math.inf if values["lockstep"] else values["missed_periods"] * values["input_period_s.power_demand"]
+    assembly = Assembly(tuple(values["wheel_names"]), vehicle.params, lambda: monitor.speed_mps, silent_s)
     types = {}
     for source in (source for sources in mapping.sources.values() for source in sources):
         _check_installed(mapping.path, source.key, source.type)

@@ -47,6 +47,8 @@ _NAN = math.nan
 _NEVER_NS = -(1 << 62)
 #: A wheel of its own topic that has not come while another came so often is missing.
 _MISSED_SETS = 3
+#: An accelerator is not pressed further; what is said to be is in another unit, and becomes a power that is refused.
+_TRAVEL_MAX, _NO_CARS_W = 1.1, 1e12
 #: What a demand that is no power is to `demand_power_w`.
 KINDS = {"force_demand": FORCE, "torque_demand": TORQUE, "acceleration_demand": ACCELERATION}
 _ARTICLES = {
@@ -127,11 +129,13 @@ class Assembly:
     wheel_names : of the four wheels as the controller knows them
     vehicle : the car, where a demand is no power or a wheel's speed is that of its rim; None where neither is so
     speed_mps : speed of the car as it is believed at present; None: the last finite one that was read
+    pedal_oldest_s : a pedal makes no demand while the other has not been heard for longer, unless it is a pressed brake
 
     Attributes
     ----------
     battery : last value of each of `mapping.BATTERY`, NaN before the first
     wanted : signal and value, in its SI unit, of the last demand
+    pedals_heard_ns : when each pedal that there is a reader for was last heard
     """
 
     def __init__(
@@ -139,6 +143,7 @@ class Assembly:
         wheel_names: Sequence[str],
         vehicle: VehicleParams | None = None,
         speed_mps: Callable[[], float] | None = None,
+        pedal_oldest_s: float = math.inf,
     ) -> None:
         self.wheel_names = tuple(wheel_names)
         self.vehicle = vehicle
@@ -147,6 +152,8 @@ class Assembly:
         self.wanted = "power_demand", _NAN
         self._speed_mps = speed_mps or (lambda: self.speed_read_mps)
         self._pedals = dict.fromkeys(PEDALS, 0.0)
+        self._pedal_oldest_ns = pedal_oldest_s * 1e9
+        self.pedals_heard_ns: dict[str, int] = {}
         self._wheels = {signal: [_NAN] * WHEELS for signal in _JOINTS}
         self._came = {signal: [0] * WHEELS for signal in _JOINTS}
 
@@ -161,11 +168,23 @@ class Assembly:
             return float(demand_power_w(KINDS[signal], value, 0.0, speed, self.vehicle))
         # A pedal that says nothing is not pressed less far than it goes; NaN stays NaN and is refused.
         self._pedals[signal] = value if math.isnan(value) else min(max(value, 0.0), 1.0)
+        if signal == PEDALS[0] and value > _TRAVEL_MAX and self._pedals[PEDALS[1]] == 0.0:
+            return _NO_CARS_W  # percent in a field of 0..1
         accelerator, brake = self._pedals.values()
         if math.isnan(brake):
             return _NAN
         # A brake demand gets through whatever the accelerator says.
         return float(demand_power_w(PEDAL_TRAVEL, 0.0 if brake > 0.0 else accelerator, brake, speed, self.vehicle))
+
+    def demand(self, signal: str, time_ns: int, value: float) -> tuple[Reading, ...]:
+        """A demand as a reading; none of a pedal while the other is not heard, but a pressed brake gets through."""
+        power_w = self.demand_w(signal, value)
+        if signal in PEDALS:
+            self.pedals_heard_ns[signal] = time_ns
+            pressed = signal == PEDALS[1] and not value <= 0.0
+            if not pressed and time_ns - min(self.pedals_heard_ns.values()) > self._pedal_oldest_ns:
+                return ()
+        return (DemandReading(time_ns, power_w),)
 
     def wanted_in_words(self) -> str:
         """The last demand as it was said, and the power it became."""
@@ -241,6 +260,8 @@ def topic_readers(
         sources = mapping.sources[signal]
         for wheel, source in enumerate(sources):
             if source.topic in types and (not signals or signal in signals):
+                if signal in PEDALS:
+                    assembly.pedals_heard_ns[signal] = _NEVER_NS
                 by_topic[source.topic].append((signal, wheel if len(sources) > 1 else -1, source))
     return {topic: _topic_reader(mapping.path, types[topic], found, assembly) for topic, found in by_topic.items()}
 
@@ -330,7 +351,7 @@ def _bind(signal: str, wheel: int, source: Source, place: int, assembly: Assembl
     if signal == "direction":
         return lambda time_ns, values, _: _direction(time_ns, scaled(values[place]))
     if signal in DEMANDS or signal in PEDALS:
-        return lambda time_ns, values, _: (DemandReading(time_ns, assembly.demand_w(signal, scaled(values[place]))),)
+        return lambda time_ns, values, _: assembly.demand(signal, time_ns, scaled(values[place]))
     if signal == "friction":
         return lambda time_ns, values, _: (FrictionReading(time_ns, scaled(values[place])),)
     return lambda time_ns, values, _: (MotionReading(time_ns, signal, scaled(values[place])),)

@@ -99,9 +99,24 @@ def test_a_car_with_odometry_pedals_and_foreign_joints_drives_and_brakes(connect
         }
 
     last = car.stack.last
-    car.stack.drive(inputs, lambda: torque_nm(last("wheel_torque_command")) > 100.0, "driving torque")
+
+    def drives() -> bool:
+        return torque_nm(last("wheel_torque_command")) > 100.0
+
+    def without(silent: str) -> Callable[[Stack], dict[str, Any]]:
+        return lambda stack: {topic: message for topic, message in inputs(stack).items() if topic != silent}
+
+    car.stack.drive(without("pedals/brake"), lambda: "waits for power_demand" in car.running.text(), "the brake pedal")
+    car.stack.drive(inputs, drives, "driving torque")
+    for silent in ("pedals/brake", "pedals/accelerator"):
+        car.stack.drive(
+            without(silent), lambda: torque_nm(last("wheel_torque_command")) == 0.0, f"no torque without {silent}"
+        )
+        car.stack.drive(inputs, drives, "driving torque again")
     brake = 50.0
-    car.stack.drive(inputs, lambda: torque_nm(last("friction_brake_command")) < -100.0, "braking torque")
+    car.stack.drive(
+        without("pedals/accelerator"), lambda: torque_nm(last("friction_brake_command")) < -100.0, "braking torque"
+    )
     assert torque_nm(last("wheel_torque_command")) < 0.0
 
 

@@ -304,6 +304,29 @@ def test_the_brake_overrides_the_accelerator_and_a_pedal_that_says_nothing_is_re
     assert math.isnan(quick["brake"](number(math.nan), 6)[0].power_w)
 
 
+def test_a_pedal_makes_no_demand_while_the_other_is_not_heard_unless_it_is_a_pressed_brake(tmp_path: Path) -> None:
+    path = tmp_path / "signals.yaml"
+    path.write_text(f"signals:\n{PEDALS}\n")
+    quick = readers_of(load_mapping(path), Assembly(WHEEL_NAMES, CAR, lambda: 10.0, pedal_oldest_s=1e-6))
+    assert quick["accelerator"](number(0.5), 1000) == ()  # the brake was never heard
+    assert quick["brake"](number(0.0), 1500) == (DemandReading(1500, pedal_power_w(0.5, 0.0, 10.0, CAR)),)
+    assert quick["brake"](number(0.0), 2001) == ()
+    braking = -0.5 * full_braking_w(10.0, CAR)
+    assert quick["brake"](number(0.5), 3000) == (DemandReading(3000, braking),)
+    assert quick["accelerator"](number(0.5), 4000) == (DemandReading(4000, braking),)
+    assert quick["accelerator"](number(0.5), 4001) == ()
+    assert math.isnan(quick["brake"](number(math.nan), 9000)[0].power_w)
+
+
+def test_an_accelerator_in_another_unit_becomes_a_power_that_is_refused(tmp_path: Path) -> None:
+    quick = read_from(tmp_path, PEDALS, 10.0)
+    full = pedal_power_w(1.0, 0.0, 10.0, CAR)
+    assert quick["accelerator"](number(1.05), 1) == (DemandReading(1, full),)
+    assert quick["accelerator"](number(30.0), 2)[0].power_w > 1e9
+    assert quick["brake"](number(30.0), 3) == (DemandReading(3, -full_braking_w(10.0, CAR)),)  # braking gets through
+    assert quick["accelerator"](number(30.0), 4) == (DemandReading(4, -full_braking_w(10.0, CAR)),)
+
+
 @pytest.mark.parametrize(
     ("entry", "problem"),
     [
