@@ -76,6 +76,7 @@ setup(
     author_email=MANIFEST.find("author").get("email"),
     maintainer=MANIFEST.findtext("maintainer"),
     maintainer_email=MANIFEST.find("maintainer").get("email"),
+    project_urls={link.get("type"): link.text for link in MANIFEST.iter("url")},
     license=MANIFEST.findtext("license"),
     python_requires=">=3.12",
     packages=find_packages(include=["iwm_power_manager*", "iwm_sim*"]),

@@ -142,7 +142,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return run(plan)
     except KeyboardInterrupt:
-        print("\ndemo: stopped; all processes have ended", file=sys.stderr)
+        kept = f"; what was recorded stays in {plan.output}" if plan.output.is_dir() else ""
+        print(f"\ndemo: stopped; all processes have ended{kept}", file=sys.stderr)
         return INTERRUPTED
     except IwmError as error:
         last_lines = error.last_lines if isinstance(error, ChildError) else []

@@ -190,7 +190,8 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--json",
         metavar="FILE",
-        help="a row for each case, with settings and hashes; or what was asked for instead; - for standard output",
+        help="a row for each case, with settings and hashes; or what was asked for instead; - for standard output, "
+        "with nothing else there",
     )
     group.add_argument("--save-series", metavar="DIR", help="a .npz for each case, with an array for each signal")
     group.add_argument("--quiet", action="store_true", help="no progress, no table")
@@ -229,6 +230,7 @@ def _add_modes(parent: argparse._ArgumentGroup) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
+    options.quiet |= options.json == "-"  # nothing else in what another program is to read
     given = given_options(sys.argv[1:] if arguments is None else arguments)
     return ended("evaluate", lambda: _evaluate(options, given))
 
@@ -250,11 +252,15 @@ def given_options(arguments: Sequence[str]) -> set[str]:
     return {"--gate-driving" if name == "--no-gate-driving" else name for name in names}
 
 
+_TABLES = f": {'; '.join(f'table {name} is of {", ".join(map(str, roads))}' for name, roads in TABLES.items())}"
+
+
 def refuse_useless(options: argparse.Namespace, given: set[str], mode: str) -> None:
     """Refuse what would change nothing, instead of leaving it unsaid; `ConfigError`."""
     if mode:
         for option in sorted(given - MODES[mode]):
-            raise ConfigError("arguments", option, f"has no effect with --{mode.replace('_', '-')}")
+            why = _TABLES if (mode, option) == ("paper", "--friction") else ""
+            raise ConfigError("arguments", option, f"has no effect with --{mode.replace('_', '-')}{why}")
         return
     strategies = set(options.strategy or [DEFAULT_STRATEGY])
     plain = strategies & set(STRATEGIES) - {REFERENCE}

@@ -6,13 +6,16 @@ from __future__ import annotations
 import ast
 import importlib
 import re
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
+import yaml
 from catkin_pkg.package import Package, parse_package
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -99,6 +102,19 @@ def test_the_version_is_the_same_everywhere(manifest: Package) -> None:
     assert importlib.import_module("iwm_power_manager").__version__ == manifest.version
     assert metadata.version("iwm_power_manager") == manifest.version
     assert re.search(rf"^(Forthcoming|{re.escape(manifest.version)} )", (ROOT / "CHANGELOG.rst").read_text(), re.M)
+
+
+def test_the_citation_says_what_the_manifest_says() -> None:
+    module = runpy.run_path(str(ROOT / "scripts" / "update_citation"))
+    citation, manifest = (ROOT / "CITATION.cff").read_text(), ElementTree.parse(ROOT / "package.xml").getroot()
+    assert module["updated"](citation, manifest) == citation, "run: scripts/update_citation"
+    for kind in ("repository", "website"):
+        ElementTree.SubElement(manifest, "url", type=kind).text = f"https://{kind}.example"
+    published = module["updated"](citation, manifest)
+    assert module["updated"](published, manifest) == published
+    content = yaml.safe_load(published)
+    assert (content["url"], content["repository-code"]) == ("https://website.example", "https://repository.example")
+    assert content["authors"] == yaml.safe_load(citation)["authors"]
 
 
 def test_the_manifest_names_every_ros_package_and_library_that_is_imported(manifest: Package) -> None:

@@ -21,9 +21,12 @@ def test_every_cell_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     notebook = jupytext.read(ROOT / "docs" / "tutorial" / f"{name}.md")
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    monkeypatch.setenv("IWM_EXAMPLES", str(ROOT / "examples"))
+    notebooks = tmp_path / "docs" / "tutorial"  # where `jupyter lab` runs what it opens there
+    notebooks.mkdir(parents=True)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     client = nbclient.NotebookClient(
-        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(notebooks)}}
     )
     client.execute()
+    assert not list(notebooks.iterdir())
     assert any(cell.cell_type == "code" and cell.outputs for cell in notebook.cells)

@@ -70,7 +70,7 @@ def test_a_cycle_is_driven_with_the_settings_that_the_node_has(hill, tmp_path):
 
 
 def test_json_goes_to_standard_output_where_it_is_asked_to(hill, capsys):
-    assert evaluate.main(["--cycle", str(hill), "--strategy", "equal", "--json", "-", "--quiet"]) == 0
+    assert evaluate.main(["--cycle", str(hill), "--strategy", "equal", "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["rows"][0]["strategy"] == "equal"
 
 
