@@ -71,6 +71,8 @@ class SqliteSource:
             self._read_topics()
         except (sqlite3.Error, ValueError, OverflowError, MemoryError) as error:
             raise BagError(f"{path}: is no readable sqlite3 bag: {_one_line(error)}") from None
+        except KeyError as error:
+            raise BagError(f"{path}: is no rosbag2 sqlite3 bag: its topics have no {error}") from None
         self._count()
         self._reader = None if self.damage else self._rosbags_reader(stack)
 

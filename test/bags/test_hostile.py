@@ -7,6 +7,7 @@ import os
 import sqlite3
 import struct
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import lz4.frame
@@ -334,3 +335,13 @@ def test_no_damaged_file_whatever_ends_in_anything_but_messages_or_one_line(
     except BagError as error:
         said.append(str(error))
     assert not any("less than before" in line or "Traceback" in line or len(line) > 2000 for line in said)
+
+
+@pytest.mark.parametrize("column", ["id", "name", "type"])
+def test_a_database_whose_topics_lack_a_column_is_refused(tmp_path: Path, column: str) -> None:
+    path = foreign.write_sqlite(tmp_path / "bag", foreign.drive(3)) / "a_0.db3"
+    with closing(sqlite3.connect(path)) as database:
+        database.execute(f"ALTER TABLE topics RENAME COLUMN {column} TO other")
+        database.commit()
+    with pytest.raises(BagError, match=f"its topics have no '{column}'"):
+        BagReader(path)
