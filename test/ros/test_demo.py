@@ -225,12 +225,13 @@ def in_the_middle(tmp_path: Path, alone: Run) -> Any:
     process.communicate()
 
 
-def test_ctrl_c_ends_every_process(in_the_middle) -> None:
+def test_ctrl_c_ends_every_process_and_says_what_stays(in_the_middle, tmp_path) -> None:
     process, nodes = in_the_middle
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert error.splitlines()[-1] == "demo: stopped; all processes have ended"
+    kept = f"what was recorded stays in {tmp_path / 'run'}"
+    assert error.splitlines()[-1] == f"demo: stopped; all processes have ended; {kept}"
     assert not any(alive(node) for node in nodes)
 
 
