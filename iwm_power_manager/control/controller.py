@@ -16,6 +16,7 @@ from iwm_power_manager.control.actuators import ActuatorLimits, ActuatorState, c
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import InputLimits, InputMonitor
+from iwm_power_manager.control.motion import DOUBT_SPEED
 from iwm_power_manager.control.record import Watch, to_numbers
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.supervision import (
@@ -109,6 +110,12 @@ class Controller:
     def wheels_lost(self) -> int:
         """Bits of the wheels that are not believed."""
         return sum(1 << i for i, verdict in enumerate(self.monitor.verdicts) if verdict is not WheelVerdict.GOOD)
+
+    @property
+    def believed_speed_mps(self) -> float:
+        """Speed of the car: as its sensor shows it, or as estimated while the law does not believe the sensor."""
+        command = self.command
+        return command.speed_mps if command and command.doubted & DOUBT_SPEED else self.monitor.speed_mps
 
     def step(self, now_ns: int, dt_s: float, elapsed_s: float | None = None) -> Step:
         """One control step.

@@ -121,7 +121,7 @@ class Tally:
     dropped : by reason
     accepted_ns : time of the last accepted one: its stamp, or when it was received if it has none (None: none yet)
     violation : why the last message was dropped, or was accepted with a reservation
-    describe : says more of a message that was out of range, "" for nothing
+    describe : says more of a message that was out of range or not finite, "" for nothing
     """
 
     received: int = 0
@@ -134,7 +134,7 @@ class Tally:
         """What was wrong with the last message, in words; "" if nothing was."""
         if self.violation is Violation.NONE:
             return ""
-        more = self.describe() if self.violation is Violation.OUT_OF_RANGE else ""
+        more = self.describe() if self.violation in (Violation.OUT_OF_RANGE, Violation.NOT_FINITE) else ""
         return self.violation.name.lower().replace("_", " ") + (f": {more}" if more else "")
 
     def age_s(self, now_ns: int) -> float:
@@ -268,14 +268,17 @@ class InputMonitor:
         reported, self.motor_torque_nm = self.motor_torque_nm, None
         return reported
 
-    def take_demand(self, demand_w: float, delay_s: float, now_ns: int) -> bool:
-        """Judge `power_demand`, received `delay_s` after it was sent; True if it was accepted."""
+    def take_demand(self, demand_w: float, delay_s: float, now_ns: int, lag_s: float = 0.0) -> bool:
+        """Judge `power_demand`, received `delay_s` after it was sent; True if it was accepted.
+
+        Its age begins `lag_s` earlier: it was put together from a part that is so much older.
+        """
         tally = self.tallies[DEMAND]
         violation = Violation.LATE if delay_s > self._limits.demand_delay_s else Violation.NONE
         if violation is Violation.NONE:
             last = math.nan if tally.accepted_ns is None else self.demand_w
             violation = check_value(demand_w, last, tally.age_s(now_ns), self._limits.demand)
-        if tally.note(violation, now_ns):
+        if tally.note(violation, now_ns - int(lag_s * _NS_PER_S)):
             self.demand_w = demand_w
             self.demand_speed_mps = self.speed_mps
             return True

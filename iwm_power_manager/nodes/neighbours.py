@@ -47,7 +47,7 @@ def look(node: Node, inputs: Inputs, outputs: Outputs) -> Neighbours:
     silent = {
         topic: "no message" if count else "no publisher"
         for topic, count in senders.items()
-        if not count or topic not in inputs.heard
+        if not count or topic not in inputs.heard_ns
     }
     return Neighbours(statuses, [*wrong, *unheard, *several], silent | mismatches)
 

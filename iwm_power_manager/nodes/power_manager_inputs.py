@@ -45,7 +45,7 @@ class Inputs:
     Attributes
     ----------
     types : message type of each topic, by full name
-    heard : topics that a message has come on, by full name
+    heard_ns : when the last message came on a topic, by full name: of the node's clock
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Inputs:
         self._demand: tuple[TopicReader, Any] | None = None
         self._full = {topic: node.resolve_topic_name(topic) for topic in readers}
         self.types = {self._full[topic]: reader.read.types.name for topic, reader in readers.items()}
-        self.heard: set[str] = set()
+        self.heard_ns: dict[str, int] = {}
         for topic, reader in readers.items():
             kind = messages.message_class(reader.read.types.name)
             asked = _asked(reader, lockstep=on_demand is not None)
@@ -92,15 +92,15 @@ class Inputs:
         ahead_ns = now_ns - time.time_ns()  # of DDS, which tells when an unstamped message was sent
         for topic, reader in self._readers.items():
             for data, info in self._intake.take(topic):
-                self.heard.add(self._full[topic])
+                self.heard_ns[self._full[topic]] = now_ns
                 for reading in reader(data, info["source_timestamp"] + ahead_ns):
                     judge(monitor, reading, now_ns)
 
     def push_demand(self, queue: LockstepQueue, data: bytes, info: dict[str, Any]) -> None:
         """Lock-step: a demand into the queue of sets."""
         assert self._demand is not None
-        self.heard.add(self._demand[1].topic_name)
         sent_ns = info["source_timestamp"]
+        self.heard_ns[self._demand[1].topic_name] = sent_ns
         for reading in self._demand[0](data, sent_ns):
             if isinstance(reading, DemandReading):
                 queue.push_demand(sent_ns, reading.power_w)
@@ -109,7 +109,7 @@ class Inputs:
         """Lock-step: what belongs to a set into the queue of sets, the rest to the monitor."""
         for topic, reader in self._readers.items():
             for data, info in self._intake.take(topic):
-                self.heard.add(self._full[topic])
+                self.heard_ns[self._full[topic]] = now_ns
                 for reading in reader(data, info["source_timestamp"]):
                     kind = _QUEUES.get(type(reading))
                     if kind is not None:
@@ -155,7 +155,7 @@ def judge(monitor: InputMonitor, reading: Any, now_ns: int) -> None:
     elif kind is BatteryReading:
         monitor.take_battery(reading, now_ns)
     elif kind is DemandReading:
-        monitor.take_demand(reading.power_w, (now_ns - reading.stamp_ns) / _NS_PER_S, now_ns)
+        monitor.take_demand(reading.power_w, (now_ns - reading.stamp_ns) / _NS_PER_S, now_ns, reading.lag_s)
     elif kind is FrictionReading:
         monitor.take_friction(reading.friction, now_ns)
     elif kind is TorqueReading:

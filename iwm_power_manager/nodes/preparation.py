@@ -7,7 +7,6 @@ and says what it does.
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -23,7 +22,7 @@ from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.ros import messages
 from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.commands import CommandWriter
-from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, SignalMapping, load_mapping
+from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, DEMANDS, PEDALS, SignalMapping, load_mapping
 from iwm_power_manager.signals.readings import Assembly, TopicReader, topic_readers
 from iwm_power_manager.signals.types import types_of
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
@@ -103,9 +102,12 @@ def _interface(
     mapping: SignalMapping, controller: Controller, vehicle: Vehicle, values: Mapping[str, Any]
 ) -> tuple[dict[str, TopicReader], dict[str, CommandWriter]]:
     mapping.check_live()
+    demands = {source.topic for signal in (*DEMANDS, *PEDALS) for source in mapping.sources.get(signal, ())}
+    if values["lockstep"] and len(demands) > 1:
+        problem = "the demand closes a set of inputs in lock-step, and comes on two topics"
+        raise ConfigError(mapping.path, "signals", problem, "one topic, or lockstep false")
     monitor = controller.monitor
-    silent_s = math.inf if values["lockstep"] else values["missed_periods"] * values["input_period_s.power_demand"]
-    assembly = Assembly(tuple(values["wheel_names"]), vehicle.params, lambda: monitor.speed_mps, silent_s)
+    assembly = Assembly(tuple(values["wheel_names"]), vehicle.params, lambda: controller.believed_speed_mps)
     types = {}
     for source in (source for sources in mapping.sources.values() for source in sources):
         _check_installed(mapping.path, source.key, source.type)

@@ -216,7 +216,7 @@ def _usable(reading: Reading) -> bool:
         return any(map(math.isfinite, reading.values))
     if isinstance(reading, TorqueReading | MotionReading):
         return True  # nobody needs them
-    return math.isfinite(reading.soc if isinstance(reading, BatteryReading) else reading[-1])
+    return math.isfinite(reading.soc if isinstance(reading, BatteryReading) else reading[1])
 
 
 def read_signal(

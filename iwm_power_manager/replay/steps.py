@@ -326,7 +326,7 @@ class ReconstructedSteps:
             topic = _TOPICS.get(type(value.reading))
             if topic is not None:
                 reading: Any = value.reading
-                content = reading[-1] if topic in (DEMAND, FRICTION) else reading
+                content = reading[1] if topic in (DEMAND, FRICTION) else reading
                 steps += (self._push if self.in_sets else self._use)(topic, content, reading.stamp_ns, value)
         return steps
 

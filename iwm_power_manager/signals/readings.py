@@ -45,10 +45,15 @@ from iwm_power_manager.signals.types import Types, types_of
 _NAN = math.nan
 #: Stamp of what cannot be read: older than anything.
 _NEVER_NS = -(1 << 62)
+#: Time of a pedal that no message tells of: newer than anything.
+_UNMAPPED_NS = 1 << 62
+#: A pedal from so far ahead is from before the clock was set back.
+_AHEAD_NS = 1_000_000_000
+_NS_PER_S = 1e9
 #: A wheel of its own topic that has not come while another came so often is missing.
 _MISSED_SETS = 3
-#: An accelerator is not pressed further; what is said to be is in another unit, and becomes a power that is refused.
-_TRAVEL_MAX, _NO_CARS_W = 1.1, 1e12
+#: A pedal may show a little more than its way; more than this is another unit, or another sign.
+_TRAVEL = (-0.1, 1.1)
 #: What a demand that is no power is to `demand_power_w`.
 KINDS = {"force_demand": FORCE, "torque_demand": TORQUE, "acceleration_demand": ACCELERATION}
 _ARTICLES = {
@@ -62,10 +67,18 @@ _ARTICLES = {
 
 
 class DemandReading(NamedTuple):
-    """What the driver wants, as power at the wheels, braking negative."""
+    """What the driver wants, as power at the wheels, braking negative.
+
+    Attributes
+    ----------
+    stamp_ns : time of the message
+    power_w : the demand; infinite if a pedal is beyond its way
+    lag_s : how much older the other pedal's last message is, where that one counts
+    """
 
     stamp_ns: int
     power_w: float
+    lag_s: float = 0.0
 
 
 class FrictionReading(NamedTuple):
@@ -129,13 +142,10 @@ class Assembly:
     wheel_names : of the four wheels as the controller knows them
     vehicle : the car, where a demand is no power or a wheel's speed is that of its rim; None where neither is so
     speed_mps : speed of the car as it is believed at present; None: the last finite one that was read
-    pedal_oldest_s : a pedal makes no demand while the other has not been heard for longer, unless it is a pressed brake
 
     Attributes
     ----------
     battery : last value of each of `mapping.BATTERY`, NaN before the first
-    wanted : signal and value, in its SI unit, of the last demand
-    pedals_heard_ns : when each pedal that there is a reader for was last heard
     """
 
     def __init__(
@@ -143,60 +153,66 @@ class Assembly:
         wheel_names: Sequence[str],
         vehicle: VehicleParams | None = None,
         speed_mps: Callable[[], float] | None = None,
-        pedal_oldest_s: float = math.inf,
     ) -> None:
         self.wheel_names = tuple(wheel_names)
         self.vehicle = vehicle
         self.battery = dict.fromkeys(BATTERY, _NAN)
         self.speed_read_mps = 0.0
-        self.wanted = "power_demand", _NAN
         self._speed_mps = speed_mps or (lambda: self.speed_read_mps)
-        self._pedals = dict.fromkeys(PEDALS, 0.0)
-        self._pedal_oldest_ns = pedal_oldest_s * 1e9
-        self.pedals_heard_ns: dict[str, int] = {}
+        self._wanted = "power_demand", _NAN, _NAN
+        self._pedals = dict.fromkeys(PEDALS, (_UNMAPPED_NS, 0.0))
         self._wheels = {signal: [_NAN] * WHEELS for signal in _JOINTS}
         self._came = {signal: [0] * WHEELS for signal in _JOINTS}
 
-    def demand_w(self, signal: str, value: float) -> float:
-        """A demand in its own unit as power at the present speed, W."""
-        self.wanted = signal, value
-        if signal == "power_demand":
-            return value
-        assert self.vehicle is not None  # checked when the readers were made
-        speed = abs(self._speed_mps())
-        if signal in DEMANDS:
-            return float(demand_power_w(KINDS[signal], value, 0.0, speed, self.vehicle))
-        # A pedal that says nothing is not pressed less far than it goes; NaN stays NaN and is refused.
-        self._pedals[signal] = value if math.isnan(value) else min(max(value, 0.0), 1.0)
-        if signal == PEDALS[0] and value > _TRAVEL_MAX and self._pedals[PEDALS[1]] == 0.0:
-            return _NO_CARS_W  # percent in a field of 0..1
-        accelerator, brake = self._pedals.values()
-        if math.isnan(brake):
-            return _NAN
-        # A brake demand gets through whatever the accelerator says.
-        return float(demand_power_w(PEDAL_TRAVEL, 0.0 if brake > 0.0 else accelerator, brake, speed, self.vehicle))
+    def expect_pedals(self, signals: Iterable[str]) -> None:
+        """These are mapped: without one of them there is no demand but to brake."""
+        self._pedals |= {signal: (_NEVER_NS, 0.0) for signal in PEDALS if signal in signals}
 
-    def demand(self, signal: str, time_ns: int, value: float) -> tuple[Reading, ...]:
-        """A demand as a reading; none of a pedal while the other is not heard, but a pressed brake gets through."""
-        power_w = self.demand_w(signal, value)
+    def demand(self, signal: str, time_ns: int, value: float) -> tuple[DemandReading, ...]:
+        """A demand in its own unit as power at the present speed; nothing as long as a pedal has never come."""
         if signal in PEDALS:
-            self.pedals_heard_ns[signal] = time_ns
-            pressed = signal == PEDALS[1] and not value <= 0.0
-            if not pressed and time_ns - min(self.pedals_heard_ns.values()) > self._pedal_oldest_ns:
-                return ()
+            return self._of_pedals(signal, time_ns, value)
+        power_w = value
+        if signal != "power_demand":
+            assert self.vehicle is not None  # checked when the readers were made
+            power_w = float(demand_power_w(KINDS[signal], value, 0.0, abs(self._speed_mps()), self.vehicle))
+        self._wanted = signal, value, power_w
         return (DemandReading(time_ns, power_w),)
+
+    def _of_pedals(self, signal: str, time_ns: int, value: float) -> tuple[DemandReading, ...]:
+        """The demand of both pedals: as old as the older one, or as the brake if that is pressed."""
+        assert self.vehicle is not None  # checked when the readers were made
+        self._pedals[signal] = time_ns, value
+        (_, accelerator), (brake_ns, brake) = (self._pedals[pedal] for pedal in PEDALS)
+        travel = 1.0 if brake > _TRAVEL[1] else _way(brake)  # a brake demand gets through whatever its unit
+        times_ns = [told for told, _ in self._pedals.values() if told != _UNMAPPED_NS]
+        oldest_ns = min(times_ns)
+        if travel > 0.0:  # and whatever the accelerator says, or does not
+            signal, value, oldest_ns = PEDALS[1], brake, brake_ns
+        elif oldest_ns == _NEVER_NS or max(times_ns) - time_ns > _AHEAD_NS:
+            return ()
+        elif not math.isfinite(_way(accelerator)):
+            signal, value = PEDALS[0], accelerator
+        power_w = _NAN
+        if not math.isnan(travel):
+            power_w = float(
+                demand_power_w(PEDAL_TRAVEL, _way(accelerator), travel, abs(self._speed_mps()), self.vehicle)
+            )
+        self._wanted = signal, value, power_w
+        return (DemandReading(time_ns, power_w, max(time_ns - oldest_ns, 0) / _NS_PER_S),)
 
     def wanted_in_words(self) -> str:
         """The last demand as it was said, and the power it became."""
-        signal, value = self.wanted
-        power = "" if signal == "power_demand" else f", which is {self.demand_w(signal, value):g} W"
-        return f"{signal} {value:g} {next(iter(UNITS[signal]))}{power}"
+        signal, value, power_w = self._wanted
+        power = f", which is {power_w:g} W" if signal != "power_demand" and math.isfinite(power_w) else ""
+        way = "; a pedal's way is 0 to 1: right unit?" if signal in PEDALS and math.isinf(_way(value)) else ""
+        return f"{signal} {value:g} {next(iter(UNITS[signal]))}{power}{way}"
 
     def warm(self, signals: Iterable[str]) -> None:
         """Compile what the conversion of these signals needs, or read it from the cache."""
         for signal in signals:
-            if signal in DEMANDS or signal in PEDALS:
-                self.demand_w(signal, 0.0)
+            if self.vehicle is not None and (signal in KINDS or signal in PEDALS):
+                demand_power_w(KINDS.get(signal, PEDAL_TRAVEL), 0.0, 0.0, 0.0, self.vehicle)
 
     def wheel(self, signal: str, wheel: int, time_ns: int, value: float) -> tuple[Reading, ...]:
         """One wheel's number; a reading once all four have come, or one of them has stayed away for long."""
@@ -208,6 +224,13 @@ class Assembly:
         values = tuple(one if count else _NAN for one, count in zip(held, came, strict=True))
         self._came[signal] = [0] * WHEELS
         return (_JOINTS[signal](time_ns, self.wheel_names, values),)
+
+
+def _way(travel: float) -> float:
+    """How far a pedal is pressed, 0..1; NaN stays NaN, and what is far from its way is infinite."""
+    if math.isnan(travel):
+        return _NAN
+    return min(max(travel, 0.0), 1.0) if _TRAVEL[0] <= travel <= _TRAVEL[1] else math.inf
 
 
 class TopicReader:
@@ -255,13 +278,12 @@ def topic_readers(
     ConfigError
         A field does not exist in the type of its topic, or is no number; names the key.
     """
+    assembly.expect_pedals(mapping.sources)
     by_topic: dict[str, list[tuple[str, int, Source]]] = defaultdict(list)
     for signal in sorted(mapping.sources, key=SIGNALS.index):  # the speed before what is judged or converted by it
         sources = mapping.sources[signal]
         for wheel, source in enumerate(sources):
             if source.topic in types and (not signals or signal in signals):
-                if signal in PEDALS:
-                    assembly.pedals_heard_ns[signal] = _NEVER_NS
                 by_topic[source.topic].append((signal, wheel if len(sources) > 1 else -1, source))
     return {topic: _topic_reader(mapping.path, types[topic], found, assembly) for topic, found in by_topic.items()}
 

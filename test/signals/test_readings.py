@@ -152,7 +152,7 @@ def test_bytes_that_are_no_message_are_a_bad_reading_and_the_next_is_read(topic:
         if before:
             quick(before, 1)
         (found,) = quick(good[:cut], 1)
-        measured = found.values if isinstance(found, JointReading) else found[1:]
+        measured = found.values if isinstance(found, JointReading) else found[1:2]
         assert all(math.isnan(value) for value in measured)
         assert quick(good, 1) == KINDS[topic][0](EXAMPLES[topic](1), 1)
 
@@ -296,35 +296,61 @@ PEDALS = "\n".join(
 def test_the_brake_overrides_the_accelerator_and_a_pedal_that_says_nothing_is_refused(tmp_path: Path) -> None:
     quick = read_from(tmp_path, PEDALS, 10.0)
     full = full_braking_w(10.0, CAR)
-    assert quick["accelerator"](number(0.5), 1) == (DemandReading(1, pedal_power_w(0.5, 0.0, 10.0, CAR)),)
     assert quick["brake"](number(0.25), 2) == (DemandReading(2, -0.25 * full),)
-    assert quick["accelerator"](number(math.nan), 3) == (DemandReading(3, -0.25 * full),)  # braking gets through
+    (braking,) = quick["accelerator"](number(math.nan), 3)  # braking gets through
+    assert braking.power_w == -0.25 * full
     assert math.isnan(quick["brake"](number(0.0), 4)[0].power_w)
-    assert quick["accelerator"](number(0.0), 5) == (DemandReading(5, 0.0),)
+    assert quick["accelerator"](number(0.0), 4) == (DemandReading(4, 0.0),)
     assert math.isnan(quick["brake"](number(math.nan), 6)[0].power_w)
 
 
-def test_a_pedal_makes_no_demand_while_the_other_is_not_heard_unless_it_is_a_pressed_brake(tmp_path: Path) -> None:
-    path = tmp_path / "signals.yaml"
-    path.write_text(f"signals:\n{PEDALS}\n")
-    quick = readers_of(load_mapping(path), Assembly(WHEEL_NAMES, CAR, lambda: 10.0, pedal_oldest_s=1e-6))
-    assert quick["accelerator"](number(0.5), 1000) == ()  # the brake was never heard
-    assert quick["brake"](number(0.0), 1500) == (DemandReading(1500, pedal_power_w(0.5, 0.0, 10.0, CAR)),)
-    assert quick["brake"](number(0.0), 2001) == ()
-    braking = -0.5 * full_braking_w(10.0, CAR)
-    assert quick["brake"](number(0.5), 3000) == (DemandReading(3000, braking),)
-    assert quick["accelerator"](number(0.5), 4000) == (DemandReading(4000, braking),)
-    assert quick["accelerator"](number(0.5), 4001) == ()
-    assert math.isnan(quick["brake"](number(math.nan), 9000)[0].power_w)
-
-
-def test_an_accelerator_in_another_unit_becomes_a_power_that_is_refused(tmp_path: Path) -> None:
+def test_pedals_that_have_not_both_come_are_no_demand_but_to_brake(tmp_path: Path) -> None:
     quick = read_from(tmp_path, PEDALS, 10.0)
-    full = pedal_power_w(1.0, 0.0, 10.0, CAR)
-    assert quick["accelerator"](number(1.05), 1) == (DemandReading(1, full),)
-    assert quick["accelerator"](number(30.0), 2)[0].power_w > 1e9
-    assert quick["brake"](number(30.0), 3) == (DemandReading(3, -full_braking_w(10.0, CAR)),)  # braking gets through
-    assert quick["accelerator"](number(30.0), 4) == (DemandReading(4, -full_braking_w(10.0, CAR)),)
+    assert quick["accelerator"](number(0.5), 1) == ()
+    quick = read_from(tmp_path, PEDALS, 10.0)
+    assert quick["brake"](number(0.0), 1) == ()
+    assert quick["brake"](number(0.5), 1) == (DemandReading(1, -0.5 * full_braking_w(10.0, CAR)),)
+
+
+def test_a_demand_is_as_old_as_the_pedal_that_has_been_silent_longest(tmp_path: Path) -> None:
+    quick = read_from(tmp_path, PEDALS, 10.0)
+    driving = pedal_power_w(0.5, 0.0, 10.0, CAR)
+    quick["brake"](number(0.0), 0)
+    assert quick["accelerator"](number(0.5), 200_000_000) == (DemandReading(200_000_000, driving, 0.2),)
+    assert quick["brake"](number(0.0), 500_000_000) == (DemandReading(500_000_000, driving, 0.3),)
+    (braking,) = quick["brake"](number(0.1), 900_000_000)
+    assert braking == DemandReading(900_000_000, -0.1 * full_braking_w(10.0, CAR))  # whatever the accelerator does
+    assert quick["accelerator"](number(0.5), 2_000_000_000)[0].lag_s == pytest.approx(1.1)  # a brake that went silent
+
+
+def test_a_pedal_from_before_the_clock_was_set_back_counts_as_never_come(tmp_path: Path) -> None:
+    quick = read_from(tmp_path, PEDALS, 10.0)
+    quick["brake"](number(0.0), 9_000_000_000)
+    assert quick["accelerator"](number(0.5), 5_000_000_000) == ()
+    quick["brake"](number(0.0), 5_000_000_000)
+    assert len(quick["accelerator"](number(0.5), 5_000_000_000)) == 1
+
+
+@pytest.mark.parametrize("travel", [30.0, -0.5, -30.0])
+def test_an_accelerator_far_beyond_its_way_is_no_number_and_the_words_say_so(tmp_path: Path, travel: float) -> None:
+    path = tmp_path / "signals.yaml"
+    path.write_text(f"signals:\n{PEDALS}")
+    assembly = Assembly(WHEEL_NAMES, CAR, lambda: 10.0)
+    quick = readers_of(load_mapping(path), assembly)
+    quick["brake"](number(0.0), 1)
+    for pedal, value in (("accelerator", travel), ("brake", 0.0)):
+        assert math.isinf(quick[pedal](number(value), 1)[0].power_w)
+        assert assembly.wanted_in_words() == f"accelerator_pedal {travel:g} 1; a pedal's way is 0 to 1: right unit?"
+    assert quick["brake"](number(0.5), 1)[0].power_w == -0.5 * full_braking_w(10.0, CAR)
+    assert quick["accelerator"](number(1.1), 1)[0].power_w == -0.5 * full_braking_w(10.0, CAR)
+    quick["brake"](number(0.0), 1)
+    assert quick["accelerator"](number(1.1), 1)[0].power_w == pedal_power_w(1.0, 0.0, 10.0, CAR)
+
+
+def test_a_brake_far_beyond_its_way_brakes_fully_and_one_of_the_wrong_sign_is_refused(tmp_path: Path) -> None:
+    quick = read_from(tmp_path, PEDALS, 10.0)
+    assert quick["brake"](number(30.0), 1)[0].power_w == -full_braking_w(10.0, CAR)
+    assert not math.isfinite(quick["brake"](number(-30.0), 1)[0].power_w)
 
 
 @pytest.mark.parametrize(
