@@ -51,6 +51,7 @@ class Announcements:
         self._problems: set[str] = set()
         self._found_s: dict[str, float] = {}
         self._values: Mapping[str, Any] = {}
+        self._heard_ns: Mapping[str, int] = {}
         self.activated()
 
     def activated(self) -> None:
@@ -116,6 +117,7 @@ class Announcements:
         trouble: Mapping[str, str],
         wheel_names: Sequence[str],
         now_ns: int,
+        heard_ns: Mapping[str, int],
     ) -> None:
         """Tell what has changed since the last call, while active.
 
@@ -126,7 +128,9 @@ class Announcements:
         trouble : why a topic is not heard, by topic
         wheel_names : the wheels in their order
         now_ns : the node's clock
+        heard_ns : when the last message came on each topic, by that clock
         """
+        self._heard_ns = heard_ns
         mode, stale = controller.supervision.mode, controller.supervision.stale
         if mode == MODE_WAITING and self._due("waiting"):
             waits = self._missing(controller, topics, trouble, ~0, now_ns)
@@ -186,8 +190,8 @@ class Announcements:
             if not stale & bit or (stale == ~0 and tally.accepted_ns is not None):
                 continue
             found = topics.get(name, ())
-            silent = tuple(topic for topic in found if topic in trouble)
-            reason = "; ".join(dict.fromkeys(trouble[topic] for topic in silent))
+            silent = tuple(topic for topic in found if topic in trouble) or self._silent(found, now_ns)
+            reason = "; ".join(dict.fromkeys(trouble[topic] for topic in silent if topic in trouble))
             if not reason and tally.why():
                 reason = f"{sum(tally.dropped.values())} messages refused, {tally.why()}"
             elif not reason and tally.received:
@@ -196,6 +200,11 @@ class Announcements:
             where = ", ".join(topic for topic in silent or found if topic != name)
             parts.append(f"{name}" + (f" on {where}" if where else "") + (f" ({reason})" if reason else ""))
         return ", ".join(parts)
+
+    def _silent(self, topics: Sequence[str], now_ns: int) -> tuple[str, ...]:
+        """Of several topics those that are missing: silent for more than half as long as the one silent longest."""
+        ages_ns = {topic: now_ns - self._heard_ns.get(topic, 0) for topic in topics}
+        return tuple(topic for topic, age_ns in ages_ns.items() if 2 * age_ns > max(ages_ns.values()))
 
     def _due(self, what: str) -> bool:
         now = time.monotonic()

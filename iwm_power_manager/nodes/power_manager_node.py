@@ -388,7 +388,8 @@ class PowerManager(Starting):
                 self._outputs.zero(self._now_ns())
             elif self._fault and self._stepper is not None and self._stepper.last_ns is not None:
                 self._fault = ""
-            self._says.stepped(controller, self._topics, self._unheard, self._wheel_names, self._now_ns())
+            heard_ns = self._inputs.heard_ns if self._inputs else {}
+            self._says.stepped(controller, self._topics, self._unheard, self._wheel_names, self._now_ns(), heard_ns)
         shown = controller and (
             controller.supervision.mode,
             controller.supervision.stale,

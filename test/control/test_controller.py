@@ -469,3 +469,13 @@ def test_the_torques_sum_to_the_demand_whenever_no_limit_and_no_gate_binds(speed
     if values["limits"] == 0 and values["gate"] == 0:
         total = sum(t * values[f"{w}_speed_radps"] for t, w in zip(motor(values), NAMES, strict=True))
         assert total == pytest.approx(demand, abs=1e-3)
+
+
+def test_the_speed_it_believes_is_the_sensors_until_that_contradicts_the_wheels(drive) -> None:
+    assert drive.controller.believed_speed_mps == 0.0
+    drive.run(100, speed=10.0, demand=0.0)
+    drive.send(speed=10.01, demand=0.0)
+    assert drive.controller.believed_speed_mps == 10.01
+    drive.run(300, speed=15.0, wheels=(10.0 / RADIUS,) * 4, demand=0.0)
+    assert drive.commands[-1].doubted == 16
+    assert drive.controller.believed_speed_mps == pytest.approx(10.0, abs=0.5)

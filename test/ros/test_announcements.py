@@ -9,8 +9,16 @@ from typing import Any
 
 import pytest
 
-from iwm_power_manager.control.monitor import Tally
-from iwm_power_manager.control.supervision import MODE_DEGRADED, STALE_BATTERY, STALE_NAMES, STALE_SPEED, Supervision
+from iwm_power_manager.control.inputs import Violation
+from iwm_power_manager.control.monitor import DEMAND, Tally
+from iwm_power_manager.control.supervision import (
+    MODE_DEGRADED,
+    STALE_BATTERY,
+    STALE_DEMAND,
+    STALE_NAMES,
+    STALE_SPEED,
+    Supervision,
+)
 from iwm_power_manager.nodes.announcements import Announcements
 
 VALUES = {"missed_periods": 3, **{f"input_period_s.{name}": 0.01 for name in STALE_NAMES.values()}}
@@ -51,7 +59,7 @@ def test_an_input_that_is_back_already_is_named_with_its_age_and_its_limit(log: 
         monitor=SimpleNamespace(tallies={name: Tally() for name in STALE_NAMES.values()}),
         command=None,
     )
-    says.stepped(controller, {}, {}, (), 0)
+    says.stepped(controller, {}, {}, (), 0, {})
     assert log.lines[-1] == (
         "degraded, motor torque fades: vehicle_speed was 0.052 s old (input_period_s 0.01, missed_periods 3), "
         "battery_state had not come yet"
@@ -69,7 +77,7 @@ def test_inputs_that_come_and_go_while_it_is_degraded_do_not_fill_the_log(log: L
             monitor=SimpleNamespace(tallies=tallies),
             command=None,
         )
-        says.stepped(controller, {}, {}, (), 0)
+        says.stepped(controller, {}, {}, (), 0, {})
     names = ("vehicle_speed", "battery_state")
     assert log.lines[before:] == [f"degraded, motor torque fades: {name}" for name in names]
 
@@ -83,3 +91,18 @@ def test_a_slow_start_says_whether_it_compiled(log: Log, compiled: int, words: s
         "preparing for 4 s so far; minutes only where precompile was not run",
         f"prepared in 4.2 s, {words}",
     ]
+
+
+def test_of_two_pedals_the_log_names_the_silent_one(log: Log) -> None:
+    says = Announcements(log)
+    says.prepared(prepared(1.0, 0))
+    tallies = {name: Tally() for name in STALE_NAMES.values()}
+    tallies[DEMAND].note(Violation.NONE, 960_000_000)
+    controller: Any = SimpleNamespace(
+        supervision=Supervision(mode=MODE_DEGRADED, stale=STALE_DEMAND),
+        monitor=SimpleNamespace(tallies=tallies),
+        command=None,
+    )
+    heard_ns = {"/accelerator": 990_000_000, "/brake": 960_000_000}
+    says.stepped(controller, {DEMAND: tuple(heard_ns)}, {}, (), 1_000_000_000, heard_ns)
+    assert log.lines[-1] == "degraded, motor torque fades: power_demand on /brake (none for 0.04 s)"
