@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 
 from iwm_power_manager.exit_codes import BAD_INPUT, FAILED
@@ -10,6 +12,8 @@ from iwm_power_manager.exit_codes import BAD_INPUT, FAILED
 #: No message gets longer: a hostile file must not fill a terminal or a log.
 MAX_MESSAGE = 1000
 _MAX_PROBLEM = 300
+#: How much alike names have to be, 0..1, for one to be taken for a slip of the other.
+_NEAR = 0.7
 
 
 def one_line(text: str, limit: int = MAX_MESSAGE) -> str:
@@ -18,6 +22,17 @@ def one_line(text: str, limit: int = MAX_MESSAGE) -> str:
     if not shown.isprintable():
         shown = "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in shown)
     return shown if len(shown) <= limit else f"{shown[: limit - 3]}..."
+
+
+def spelled_like(given: str, known: Iterable[str]) -> list[str]:
+    """Up to three of the known names that `given` may be a slip of, the likest first."""
+    return difflib.get_close_matches(given, list(known), 3, _NEAR)
+
+
+def did_you_mean(names: Iterable[str]) -> str:
+    """Question that names these, as the end of a message; "" for none."""
+    meant = " or ".join(names)
+    return f"; did you mean {meant}?" if meant else ""
 
 
 class IwmError(Exception):

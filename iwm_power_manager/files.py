@@ -23,7 +23,8 @@ from typing import Any
 
 import yaml
 
-from iwm_power_manager.errors import ConfigError
+from iwm_power_manager import share
+from iwm_power_manager.errors import ConfigError, did_you_mean, spelled_like
 
 #: Bytes of a file that is read whole (a policy, counted transitions).
 MAX_FILE_BYTES = 256 * 2**20
@@ -55,7 +56,8 @@ def _blocks(path: Path | str) -> Iterator[bytes]:
             while block := file.read(_BLOCK):
                 yield block
     except OSError as error:
-        raise ConfigError(path, "", f"cannot be read: {error.strerror or error}") from None
+        near = share.did_you_mean(Path(path)) if isinstance(error, FileNotFoundError) else ""
+        raise ConfigError(path, "", f"cannot be read: {error.strerror or error}{near}") from None
     except ValueError as error:  # a null character in the path
         raise ConfigError(path, "", f"cannot be read: {error}") from None
 
@@ -357,7 +359,8 @@ def check_choice(file: Path | str, key: str, value: Any, choices: Iterable[str])
     """`value`, if it is one of `choices`, else a `ConfigError`."""
     choices = tuple(choices)
     if not isinstance(value, str) or value not in choices:
-        raise ConfigError(file, key, f"{value!r} is unknown", " | ".join(choices))
+        near = did_you_mean(spelled_like(value, choices)) if isinstance(value, str) else ""
+        raise ConfigError(file, key, f"{value!r} is unknown", " | ".join(choices) + near)
     return value
 
 

@@ -8,18 +8,15 @@ ROS is needed to find them.
 from __future__ import annotations
 
 import contextlib
-import difflib
 import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 
+from iwm_power_manager import errors
 from iwm_power_manager.errors import ConfigError
 
 PACKAGE = "iwm_power_manager"
-
-#: How much alike names have to be, 0..1, for one to be taken for a slip of the other.
-_NEAR = 0.7
 
 
 def roots() -> list[Path]:
@@ -90,9 +87,8 @@ def did_you_mean(given: Path, known: Iterable[str] = ()) -> str:
     with contextlib.suppress(OSError):
         names |= {path.name for path in given.parent.iterdir()}
     by_stem = {Path(name).stem: name for name in sorted(names)}
-    near = difflib.get_close_matches(given.stem, by_stem, n=3, cutoff=_NEAR)
-    meant = [str(given.with_name(by_stem[stem] if given.suffix else stem)) for stem in near]
-    return f"; did you mean {' or '.join(meant)}?" if meant else ""
+    near = errors.spelled_like(given.stem, by_stem)
+    return errors.did_you_mean(str(given.with_name(by_stem[stem] if given.suffix else stem)) for stem in near)
 
 
 def _files(root: Path) -> list[Path]:

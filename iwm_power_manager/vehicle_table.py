@@ -2,13 +2,15 @@
 """Every number of a vehicle file: unit, range, meaning, who reads it, and what holds where the file does not give it.
 
 The one table that `vehicle` checks files by and `docs/vehicle.md` prints. A tyre's own numbers stand with its model
-(`model.tyre`).
+(`model.tyre`), which checks them; what they mean to a reader stands here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
+
+from iwm_power_manager.model.tyre import MODELS
 
 #: Static stability factor, half the track over the height of the centre of gravity, that is assumed at least where the
 #: track is not given: passenger cars have 1.2 to 1.5 (NHTSA).
@@ -157,6 +159,16 @@ TABLE: dict[str, dict[str, Quantity]] = {
     },
 }
 
+#: Of each model's own numbers, which have no unit. Ranges stand with the model.
+TYRE_MEANINGS = {
+    "stiffness_factor": "Magic Formula's B: slope at no slip over friction is B C D (eq. 9)",
+    "shape_factor": "its C: how far friction falls beyond the peak; 1: not at all",
+    "peak_factor": "its D: largest friction coefficient over that of the road",
+    "curvature_factor": "its E: where the peak lies; lower: at less slip and sharper",
+    "slip_stiffness": "friction coefficient per slip at no slip, on any road",
+    "sliding_factor": "friction of the sliding tyre over its peak",
+}
+
 #: Pairs that must be ordered (a fade between two equal points would divide by zero), and whether they may be equal.
 ORDERED: dict[str, tuple[tuple[str, str, bool], ...]] = {
     "motor": (
@@ -184,4 +196,10 @@ def markdown() -> str:
             low = f"above {q.low:g}" if q.above else f"{q.low:g}"
             policy = "yes" if q.decides else ""
             lines.append(f"| `{where}` | {q.unit} | {low} to {q.high:g} | {q.meaning} | {q.default} | {policy} |")
+        if section == "tyre":
+            lines += [
+                f"| `tyre.{key}` |  | {low:g} to {high:g} | `model: {name}`: {TYRE_MEANINGS[key]} |  | yes |"
+                for name, model in MODELS.items()
+                for key, (low, high) in model.ranges.items()
+            ]
     return "\n".join(lines) + "\n"

@@ -11,6 +11,7 @@ from iwm_power_manager.tools.command import picture
 def parser():
     made = CommandParser("draw", description="Draws.\n\n  as typed")
     made.add_argument("--plot", type=picture)
+    made.add_argument("--strategy", choices=["sdp", "sdp_lookahead", "equal"])
     made.add_subparsers(dest="what").add_parser("all").add_argument("--many", type=int)
     return made
 
@@ -20,6 +21,9 @@ def parser():
     [
         (["--no-such"], "unrecognized arguments: --no-such", "draw"),
         (["--plot", "a.txt"], "a.txt is no picture's name; allowed: ending in .pdf, .png, .svg", "draw"),
+        (["--strategy", "sdp_lookahed"], "'sdp_lookahead', 'equal'); did you mean sdp_lookahead?", "draw"),
+        (["--strategy", "magic"], "'magic' (choose from 'sdp', 'sdp_lookahead', 'equal') (see", "draw"),
+        (["al"], "did you mean all?", "draw"),
         (["all", "--many", "x"], "invalid int value: 'x'", "draw all"),
     ],
 )

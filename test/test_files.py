@@ -145,7 +145,9 @@ def test_integers_choices_and_switches_are_checked():
         files.check_integer("f", "k", 1.5, 0, 5)
     with pytest.raises(ConfigError, match="9 is out of range; allowed: 0 to 5 s"):
         files.check_integer("f", "k", 9, 0, 5, unit="s")
-    with pytest.raises(ConfigError, match=r"'c' is unknown; allowed: a \| b"):
+    with pytest.raises(ConfigError, match=r"'equall' is unknown; allowed: equal \| rule; did you mean equal\?"):
+        files.check_choice("f", "k", "equall", ("equal", "rule"))
+    with pytest.raises(ConfigError, match=r"'c' is unknown; allowed: a \| b$"):
         files.check_choice("f", "k", "c", ("a", "b"))
     with pytest.raises(ConfigError, match=r"\['a'\] is unknown"):
         files.check_choice("f", "k", ["a"], ("a", "b"))

@@ -9,6 +9,7 @@ import pytest
 
 from iwm_power_manager import share
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import read_bytes
 
 
 def test_a_file_of_the_package_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,3 +93,11 @@ def test_the_files_of_an_installation_are_found_without_any_variable(
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
     monkeypatch.setattr(share, "__file__", str(tmp_path / library / "iwm_power_manager" / "share.py"))
     assert share.roots()[0] == shared
+
+
+def test_a_file_that_is_not_there_is_answered_with_its_neighbours_of_nearly_that_name(tmp_path: Path) -> None:
+    (tmp_path / "my_van.yaml").touch()
+    with pytest.raises(ConfigError, match=rf"No such file or directory; did you mean {tmp_path}/my_van\.yaml\?$"):
+        read_bytes(tmp_path / "my_vann.yaml")
+    with pytest.raises(ConfigError, match=r"No such file or directory$"):
+        read_bytes(tmp_path / "else.yaml")

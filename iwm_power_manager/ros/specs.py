@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from iwm_power_manager.control.settings import Change
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.errors import IwmError, did_you_mean, spelled_like
 
 Value = bool | int | float | str | list[str] | list[float]
 
@@ -76,7 +76,8 @@ class Spec(NamedTuple):
             wrong = self.length > 0 and not (all(value) and len(set(value)) == self.length)
         else:
             wrong = not all(self.low <= item <= self.high for item in value)
-        return f"{self.name}: {value!r} is not allowed; allowed: {self.allowed()}" if wrong else ""
+        near = did_you_mean(spelled_like(str(value), self.choices))
+        return f"{self.name}: {value!r} is not allowed; allowed: {self.allowed()}{near}" if wrong else ""
 
 
 def yaml_text(specs: Iterable[Spec], introduction: str) -> str:

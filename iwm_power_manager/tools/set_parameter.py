@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from iwm_power_manager.command_line import CommandParser
-from iwm_power_manager.errors import FailedError, IwmError
+from iwm_power_manager.errors import FailedError, IwmError, did_you_mean, spelled_like
 from iwm_power_manager.exit_codes import DONE, FAILED
 from iwm_power_manager.ros.asking import AGAIN_S, Question
 from iwm_power_manager.ros.specs import ParameterError
@@ -69,9 +68,8 @@ class _Remote:
         known = sorted(self._ask(ListParameters, "list_parameters").result.names)
         for name in names:
             if name not in known:
-                near = difflib.get_close_matches(name, known)
-                hint = f"; did you mean {' or '.join(near)}?" if near else ""
-                raise FailedError(f"{self._name}: {name}: no such parameter{hint}")
+                near = did_you_mean(spelled_like(name, known))
+                raise FailedError(f"{self._name}: {name}: no such parameter{near}")
         wanted = list(names) or known
         values = self._ask(GetParameters, "get_parameters", names=wanted).values
         return {name: parameter_value_to_python(value) for name, value in zip(wanted, values, strict=True)}
@@ -98,7 +96,8 @@ class _Remote:
         results = self._ask(SetParameters, "set_parameters", parameters=parameters).results
         for parameter, result in zip(parameters, results, strict=True):
             if not result.successful:
-                raise FailedError(f"{self._name}: {parameter.name}: {result.reason or 'refused'}")
+                reason = result.reason.removeprefix(f"{parameter.name}: ") or "refused"
+                raise FailedError(f"{self._name}: {parameter.name}: {reason}")
         for name, value in self.values(list(given)).items():
             print(f"{name}: {now[name]} -> {value}")
 

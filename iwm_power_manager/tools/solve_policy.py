@@ -194,9 +194,10 @@ def _solve_into(options: argparse.Namespace) -> int:
 
 def _demand_arguments(options: argparse.Namespace) -> None:
     """What argparse cannot say: needed for solving, but not for --check."""
-    for name in ("friction", "output"):
+    needed = {"friction": "each 0.01 to 2, as in --friction 0.9 0.5 0.2", "output": "a folder, or a .npz file"}
+    for name, allowed in needed.items():
         if not getattr(options, name):
-            raise ConfigError("arguments", f"--{name}", "is missing")
+            raise ConfigError("arguments", f"--{name}", "is missing", allowed)
     if not (options.cycle or options.bag or options.transitions):
         raise ConfigError("arguments", "--cycle", "is missing", "one cycle, bag or file of transitions, or more")
     if options.export_mdp and len(options.friction) > 1:

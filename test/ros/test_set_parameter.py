@@ -51,6 +51,8 @@ def test_values_are_read_and_set_and_a_transition_is_made(pair) -> None:
     ("argument", "code", "problem"),
     [
         ("friction=7.0", FAILED, "friction"),
+        ("strategy=eqaul", FAILED, "/power_manager: strategy: 'eqaul' is not allowed; allowed: "),
+        ("strategy=eqaul", FAILED, "; did you mean equal?"),
         ("=3", BAD_INPUT, "'=3' is not allowed; allowed: NAME=VALUE"),
         ("frictoin=0.3", FAILED, "frictoin: no such parameter; did you mean friction"),
     ],

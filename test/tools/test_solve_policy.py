@@ -249,7 +249,7 @@ def test_thin_and_missing_data_is_warned_about(tmp_path, grid, capsys):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--cycle", "nycc", "--output", "x"], "--friction: is missing"),
+        (["--cycle", "nycc", "--output", "x"], "--friction: is missing; allowed: each 0.01 to 2, as in --friction 0.9"),
         (["--cycle", "nycc", "--friction", "0.5"], "--output: is missing"),
         (["--friction", "0.5", "--output", "x"], "--cycle: is missing"),
         (
