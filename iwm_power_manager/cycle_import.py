@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import re
 from dataclasses import dataclass, field
@@ -44,12 +45,13 @@ class Log:
 
     Attributes
     ----------
+    path : of the file
     time_s, speed_mps, grade : of the samples that are usable, times rising from 0
     speed_unit, time_unit : of the file
     said : what was guessed or left out, one line each
     """
 
-    name: str
+    path: Path | str
     time_s: FloatArray
     speed_mps: FloatArray
     grade: FloatArray
@@ -62,9 +64,13 @@ class Log:
         """The usual distance of two samples."""
         return float(np.median(np.diff(self.time_s)))
 
+    def gaps_after(self, longer_s: float) -> list[int]:
+        """Index of the last sample before every gap."""
+        return np.flatnonzero(np.diff(self.time_s) > longer_s).tolist()
+
     def gaps(self, longer_s: float) -> list[tuple[float, float]]:
         """Start and length of every gap."""
-        at = np.flatnonzero(np.diff(self.time_s) > longer_s)
+        at = self.gaps_after(longer_s)
         return [(float(self.time_s[i]), float(self.time_s[i + 1] - self.time_s[i])) for i in at]
 
     def noise_mps(self) -> float:
@@ -215,7 +221,7 @@ def _in_si(
     if lowest < 0.0:
         said.append(f"speeds below zero, down to {lowest:.2g} m/s, taken for rest")
         speed = np.maximum(speed, 0.0)
-    return Log(Path(path).stem, time, speed, arrays["grade"], units["speed"], units["time"], said)
+    return Log(path, time, speed, arrays["grade"], units["speed"], units["time"], said)
 
 
 def to_cycle(log: Log, gaps: str, max_gap_s: float, smooth_s: float, rate_hz: float) -> Cycle:
@@ -237,7 +243,7 @@ def to_cycle(log: Log, gaps: str, max_gap_s: float, smooth_s: float, rate_hz: fl
     if found and gaps == "refuse":
         start, length = max(found, key=lambda gap: gap[1])
         problem = f"has {len(found)} gap{'s' * (len(found) > 1)}, the longest of {length:.4g} s from {start:.6g} s"
-        raise ConfigError(log.name, "", problem, "--gaps bridge, --gaps cut, or a larger --max-gap")
+        raise ConfigError(log.path, "", problem, "--gaps bridge, --gaps cut, or a larger --max-gap")
     time: FloatArray = log.time_s
     speed, grade = log.speed_mps, log.grade
     if gaps == "cut":
@@ -248,7 +254,7 @@ def to_cycle(log: Log, gaps: str, max_gap_s: float, smooth_s: float, rate_hz: fl
         fine_step = min(step, log.step_s)
         if fine_step < _SHORTEST_STEP_S or (time[-1] - time[0]) / fine_step > MAX_SAMPLES:
             problem = f"lasts {time[-1] - time[0]:.4g} s with samples {fine_step:.2g} s apart"
-            raise ConfigError(log.name, "", problem, f"{MAX_SAMPLES} samples, {_SHORTEST_STEP_S:g} s apart or more")
+            raise ConfigError(log.path, "", problem, f"{MAX_SAMPLES} samples, {_SHORTEST_STEP_S:g} s apart or more")
         even: FloatArray = np.arange(int((time[-1] - time[0]) / step + 1e-9) + 1) * np.float64(step)
         fine = np.arange(int((time[-1] - time[0]) / fine_step + 1e-9) + 1) * fine_step
         smoothed = _smoothed(np.interp(fine, time, speed), smooth_s / fine_step)
@@ -256,8 +262,8 @@ def to_cycle(log: Log, gaps: str, max_gap_s: float, smooth_s: float, rate_hz: fl
         time = even
     wrong = implausible(time, speed)
     if wrong:
-        raise ConfigError(log.name, "", f"speed {wrong[1]}", "another unit, or --smooth against single wrong samples")
-    return make_cycle(log.name, time, speed, grade)
+        raise ConfigError(log.path, "", f"speed {wrong[1]}", "another unit, or --smooth against single wrong samples")
+    return dataclasses.replace(make_cycle(str(log.path), time, speed, grade), name=Path(log.path).stem)
 
 
 def _without_gaps(time: FloatArray, speed: FloatArray, max_gap_s: float, step_s: float) -> FloatArray:

@@ -13,14 +13,16 @@ from iwm_power_manager.motor_map import COLUMNS, RANGES
 from iwm_power_manager.tables import Table, read_table
 
 RAD_S_PER_RPM = 2.0 * math.pi / 60.0
+_SPEED_NAMES = {"rpm": r"rpm|1/min|min-1|min\^-1|u/min", "rad/s": r"rad_?/?s\b|rad_?per_?s|radps"}
 _NOTHING = ("", "nan", "-", "n/a", "na", "null", "none", "inf")
 
 
 class Points(NamedTuple):
-    """Efficiencies (NaN where there is none) by speed (rad/s) and torque (N m), and what was guessed."""
+    """Efficiencies (NaN where there is none) by speed (rad/s) and torque (N m), what was guessed, what is doubtful."""
 
     efficiency: dict[tuple[float, float], float]
     said: list[str]
+    doubts: list[str]
 
 
 def read_points(
@@ -58,9 +60,13 @@ def read_points(
         layout = "list" if len(table.rows[-1][1]) == 3 else "matrix"
         said.append(f"layout {layout}: it has {len(table.rows[-1][1])} columns")
     header = " ".join(table.rows[0][1])
+    named = next((unit for unit, names in _SPEED_NAMES.items() if re.search(names, header, re.IGNORECASE)), "")
+    doubts = []
     if speed_unit == "auto":
-        speed_unit = "rpm" if re.search(r"rpm|1/min|min-1|min\^-1|u/min", header, re.IGNORECASE) else "rad/s"
-        said.append(f"speeds in {speed_unit}" + (", as the header says" if speed_unit == "rpm" else ": guessed"))
+        speed_unit = named or "rad/s"
+        said.append(f"speeds in {speed_unit}" + (", as the header says" if named else ": guessed"))
+    elif named not in ("", speed_unit):
+        doubts.append(f"speeds in {speed_unit}, as --speed-unit says, although the header says {named}")
     try:
         cells = _list(table) if layout == "list" else _matrix(table, down)
     except ConfigError as error:
@@ -78,7 +84,7 @@ def read_points(
         if key in points:
             raise ConfigError(path, f"line {line}", f"repeats speed {speed:g}, torque {torque:g}")
         points[key] = _efficiency(path, line, key, value / 100.0 if percent else value, quantity)
-    return Points(points, said)
+    return Points(points, said, doubts)
 
 
 def _value(table: Table, line: int, text: str, column: str) -> float:

@@ -10,7 +10,6 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iwm_power_manager import __version__
@@ -139,7 +138,7 @@ def _import(options: argparse.Namespace) -> None:
         print(f"import_cycle: warning: {vehicle.name}: {warning}", file=sys.stderr)
     atomic_write(options.output, cycle_text(cycle, bool(options.grade)).encode())
     if options.plot:
-        _draw(options.plot, log, raw, cycle, options.max_gap)
+        _draw(options, log, raw, cycle)
     if options.json:
         command.write_json(options.json, numbers)
 
@@ -199,7 +198,8 @@ def _text(options: argparse.Namespace, log: Log, numbers: dict[str, Any]) -> str
     return "\n".join(lines)
 
 
-def _draw(path: Path, log: Log, raw: Cycle, cycle: Cycle, max_gap_s: float) -> None:
+def _draw(options: argparse.Namespace, log: Log, raw: Cycle, cycle: Cycle) -> None:
+    import numpy as np
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 6.0), layout="constrained")
@@ -207,19 +207,27 @@ def _draw(path: Path, log: Log, raw: Cycle, cycle: Cycle, max_gap_s: float) -> N
     # The hardest minute is where a wrong unit or too much smoothing shows.
     steepest = int(abs(cycle.speed_mps[1:] - cycle.speed_mps[:-1]).argmax())
     middle = float(cycle.time_s[steepest])
+    # Where the log has no sample, no line of the log; its samples are those of the raw cycle, gaps cut out or not.
+    gaps = log.gaps_after(_MISSED * log.step_s)
+    after = np.array(gaps, dtype=int) + 1
+    logged = [np.insert(values, after, np.nan) for values in (raw.time_s, 3.6 * raw.speed_mps)]
     for axes in (whole, part):
-        axes.plot(raw.time_s, 3.6 * raw.speed_mps, color="0.6", linewidth=2.5, label=f"log ({log.speed_unit})")
+        axes.plot(*logged, color="0.6", linewidth=2.5, label=f"log ({log.speed_unit})")
         axes.plot(cycle.time_s, 3.6 * cycle.speed_mps, color="C0", linewidth=1.0, label="cycle")
         axes.set_ylabel("speed, km/h")
         axes.grid(alpha=0.3)
     part.set_xlim(max(middle - 30.0, 0.0), min(middle + 30.0, float(cycle.time_s[-1])))
     part.set_xlabel("time, s")
-    if raw.time_s.size == log.time_s.size and raw.duration_s == log.time_s[-1] - log.time_s[0]:
-        for start, length in log.gaps(max_gap_s):
-            whole.axvspan(start, start + length, color="C3", alpha=0.2)
+    part.set_title("the minute around the hardest change of speed", fontsize="medium")
+    cut = set(log.gaps_after(options.max_gap)) if options.gaps == "cut" else set()
+    for label, colour, found in (("bridged", "C3", [i for i in gaps if i not in cut]), ("cut out", "C4", sorted(cut))):
+        spans = [(raw.time_s[i], raw.time_s[i + 1] - raw.time_s[i]) for i in found]
+        for axes in (whole, part) if spans else ():
+            area = axes.get_xaxis_transform()
+            axes.broken_barh(spans, (0.0, 1.0), transform=area, color=colour, alpha=0.2, label=label)
     whole.legend(loc="upper right")
-    whole.set_title(f"{cycle.name}: {cycle.duration_s:.0f} s, {cycle.distance_m / 1000.0:.2f} km")
-    command.write_picture(path, figure)
+    whole.set_title(f"{options.log}: {cycle.duration_s:.0f} s, {cycle.distance_m / 1000.0:.2f} km")
+    command.write_picture(options.plot, figure)
 
 
 if __name__ == "__main__":

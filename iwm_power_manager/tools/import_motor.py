@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iwm_power_manager import __version__
@@ -128,6 +127,7 @@ def _import(options: argparse.Namespace) -> None:
         "package_version": __version__,
         "table": str(options.table),
         "said": points.said,
+        "doubts": points.doubts,
         "speeds_radps": found.speed_radps.tolist(),
         "torques_nm": found.torque_nm.tolist(),
         "known_points": known,
@@ -140,11 +140,11 @@ def _import(options: argparse.Namespace) -> None:
     }
     if not options.quiet:
         print(_text(options, found, fit, numbers))
-    for line in lacking:
-        print(f"import_motor: warning: it lacks {line}", file=sys.stderr)
+    for line in (*points.doubts, *(f"it lacks {line}" for line in lacking)):
+        print(f"import_motor: warning: {line}", file=sys.stderr)
     atomic_write(options.output, map_text(points).encode())
     if options.plot:
-        _draw(options.plot, found, reach)
+        _draw(options, found, reach)
     if options.json:
         command.write_json(options.json, numbers)
 
@@ -193,7 +193,14 @@ def _text(options: argparse.Namespace, found: MotorMap, fit: LossFit, numbers: d
     )
 
 
-def _draw(path: Path, found: MotorMap, reach: Reach) -> None:
+def _limits(options: argparse.Namespace) -> str:
+    """What the drawn limits are: the motor's, or as far as the table goes."""
+    names = ("peak_torque", "regeneration_torque", "max_power", "top_speed")
+    of_table = [name.replace("_", " ") for name in names if getattr(options, name) is None]
+    return "limits of the motor" if not of_table else f"limits; outermost points of the table: {', '.join(of_table)}"
+
+
+def _draw(options: argparse.Namespace, found: MotorMap, reach: Reach) -> None:
     import numpy as np
     from matplotlib.figure import Figure
 
@@ -212,12 +219,12 @@ def _draw(path: Path, found: MotorMap, reach: Reach) -> None:
     known = ~np.isnan(found.loss_w)
     axes.plot(speed[known], torque[known], ".", color="black", markersize=2, label="points with a loss")
     line = np.linspace(0.0, max(reach.top_speed_radps, 1e-3), 200)
-    axes.plot(line, reach.limit_nm(line, True), color="C3", label="limits of the motor")
+    axes.plot(line, reach.limit_nm(line, True), color="C3", label=_limits(options))
     axes.plot(line, -reach.limit_nm(line, False), color="C3")
     axes.set_xlabel("speed, rad/s")
     axes.set_ylabel("torque, N m (driving positive)")
-    axes.legend(loc="upper right")
-    command.write_picture(path, figure)
+    figure.legend(loc="outside lower center", ncols=2)
+    command.write_picture(options.plot, figure)
 
 
 if __name__ == "__main__":

@@ -197,8 +197,8 @@ def _what_if(bag: BagReader, options: argparse.Namespace) -> int:
 
 def _consumption_line(row: Consumption, saving: float | None) -> str:
     return (
-        f"  {row.label:20} {row.chemical_wh:9.2f} {row.wh_per_km:8.2f} {row.wheel_work_wh:10.2f} "
-        f"{row.friction_wh:8.2f} {row.idle_drag_wh:9.2f} " + ("       –" if saving is None else f"{saving:7.2f}%")
+        f"  {row.label:20} {row.chemical_wh:z9.2f} {row.wh_per_km:z8.2f} {row.wheel_work_wh:z10.2f} "
+        f"{row.friction_wh:z8.2f} {row.idle_drag_wh:z9.2f} " + ("       –" if saving is None else f"{saving:z7.2f}%")
     )
 
 

@@ -72,10 +72,16 @@ def test_a_gap_is_bridged_or_cut_by_choice_and_never_in_silence(tmp_path, capsys
     assert code == 2
     assert "has 1 gap, the longest of 52 s from 199 s; allowed: --gaps bridge, --gaps cut" in err
     assert not output.exists()
-    code, out, _ = run(capsys, log, "--output", output, "--gaps", "bridge")
+    assert err.startswith(f"import_cycle: error: {log}: ")
+    svg = tmp_path / "trip.svg"
+    code, out, _ = run(capsys, log, "--output", output, "--gaps", "bridge", "--plot", svg)
+    assert "<!-- bridged -->" in svg.read_text()
+    assert "<!-- cut out -->" not in svg.read_text()
     assert "gap of 52 s from 199 s bridged by a straight line" in out
     assert load_cycle(output).duration_s == NYCC.duration_s
-    code, out, _ = run(capsys, log, "--output", output, "--gaps", "cut")
+    code, out, _ = run(capsys, log, "--output", output, "--gaps", "cut", "--plot", svg)
+    assert "<!-- cut out -->" in svg.read_text()
+    assert "<!-- bridged -->" not in svg.read_text()
     assert "cut out" in out
     assert NYCC.duration_s - 52 < load_cycle(output).duration_s < NYCC.duration_s - 40
     code, out, _ = run(capsys, log, "--output", output, "--max-gap", "60")

@@ -16,6 +16,7 @@ from iwm_power_manager.tools.import_motor import main
 MAP = share_path("config/motors/siemens_pm_7500w.csv")
 WHOLE = read_map(MAP)
 RPM = 60.0 / (2.0 * math.pi)
+DEMANDS = ("--peak-torque", 300, "--regeneration-torque", 80, "--max-power", 7500, "--top-speed", 200)
 
 
 def efficiency(i, j):
@@ -83,13 +84,12 @@ def test_losses_become_efficiencies(tmp_path, capsys):
 
 
 def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys):
-    demands = ("--peak-torque", 300, "--regeneration-torque", 80, "--max-power", 7500, "--top-speed", 200)
-    code, _, err = run(capsys, MAP, "--output", tmp_path / "map.csv", *demands)
+    code, _, err = run(capsys, MAP, "--output", tmp_path / "map.csv", *DEMANDS)
     assert code == 0
     assert "it lacks speeds from 150 to the 200 rad/s" in err
     assert "it lacks torques from 200 to the peak torque, 300 N m" in err
     assert "it lacks torques from 0 to the regeneration torque" in err
-    assert "regeneration" not in run(capsys, MAP, "--output", tmp_path / "map.csv", *demands, "--mirror")[2]
+    assert "regeneration" not in run(capsys, MAP, "--output", tmp_path / "map.csv", *DEMANDS, "--mirror")[2]
 
 
 @pytest.mark.parametrize(
@@ -120,6 +120,23 @@ def test_what_cannot_be_used_is_one_line_and_nothing_is_written(tmp_path, capsys
     assert err.count("\n") == 1
     assert words in err
     assert not (tmp_path / "map.csv").exists()
+
+
+def test_a_unit_that_contradicts_the_header_is_warned_of(tmp_path, capsys):
+    table = tmp_path / "sheet.csv"
+    rows = "".join(f"{w * RPM:.8f},{t},{e:.8f}\n" for w, t, e in points())
+    for header, unit in (("n/rpm", "rad/s"), ("speed_rad_s", "rpm")):
+        table.write_text(f"{header},T/Nm,eta\n{rows}")
+        err = run(capsys, table, "--output", tmp_path / "map.csv", "--speed-unit", unit, "--quiet")[2]
+        assert f"speeds in {unit}, as --speed-unit says, although the header says" in err
+    assert run(capsys, table, "--output", tmp_path / "map.csv", "--quiet")[2] == ""
+
+
+@pytest.mark.parametrize(("options", "words"), [((), "outermost points of the table: peak"), (DEMANDS, "of the motor")])
+def test_the_picture_says_whose_limits_it_draws(tmp_path, capsys, options, words):
+    code, _, _ = run(capsys, MAP, "--output", tmp_path / "map.csv", "--plot", tmp_path / "map.svg", *options)
+    assert code == 0
+    assert words in (tmp_path / "map.svg").read_text()
 
 
 def test_a_file_that_is_not_there_is_answered_with_the_names_near_it(tmp_path, monkeypatch, capsys):
