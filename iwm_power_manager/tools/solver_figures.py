@@ -44,12 +44,12 @@ def draw_demand(axes: Axes, chain: DemandChain) -> None:
     axes.figure.colorbar(image, ax=axes, label="probability")
     for rows, marker, label in (
         (chain.row_steps == 0.0, "x", "no data"),
-        ((chain.row_steps > 0.0) & (chain.row_steps < THIN_ROW_STEPS), "_", "little data"),
+        ((chain.row_steps > 0.0) & (chain.row_steps < THIN_ROW_STEPS), "_", f"fewer than {THIN_ROW_STEPS:g} steps"),
     ):
         if rows.any():
             axes.plot(np.full(rows.sum(), power[0]), power[rows], marker, color="tab:red", label=label, clip_on=False)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc="upper left")
+        axes.legend(loc="lower right")
     axes.set(title="Power demand: one step", xlabel="next demand, kW", ylabel="demand, kW")
 
 

@@ -138,6 +138,8 @@ def depletion_over_split_panels(panels: Sequence[tuple[str, Sequence[Curve]]]) -
                 axis.plot(power_kw[best], depletion[best], "o", markersize=5, color=COLOURS[index % 6])
         axis.set_title(title)
         axis.set_ylabel("ΔSoC per step, %")
+        # The same kind of number in every panel: no power of ten apart from the axis.
+        axis.ticklabel_format(axis="y", style="plain", useOffset=False)
         if len(curves) > 1:
             axis.legend(ncols=min(3, len(curves)))
     axes[-1].set_xlabel("Power of the front axle, kW")

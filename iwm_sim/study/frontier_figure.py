@@ -35,7 +35,8 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
             (f"{RIVAL}, thresholds", [p for p in frontier.rivals if p.strategy == RIVAL], COLOURS[1], "o-"),
             ("instantaneous", [p for p in frontier.rivals if p.strategy != RIVAL], COLOURS[3], "s"),
             ("ours, budgets", frontier.ours, COLOURS[0], "o-"),
-            ("known in advance", frontier.bounds, COLOURS[6], "x--"),
+            # It bounds the changes of the first panel; those of the others are only counted.
+            ("known in advance", frontier.bounds, COLOURS[6], "x--" if count == COUNTS[0] else "x"),
         )
         for name, points, colour, style in families:
             _curve(axis, name, points, count, colour, style)
@@ -51,8 +52,14 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
 
 def _curve(axis: Axes, name: str, points: Sequence[Point], count: str, colour: str, style: str) -> None:
     known = sorted((getattr(p, count), p.saving_percent) for p in points if p.saving_percent is not None)
-    if known:
-        axis.plot(*zip(*known, strict=True), style, color=colour, label=name, markersize=4)
+    if not known:
+        return
+    changes, saving = zip(*known, strict=True)
+    axis.plot(changes, saving, style[0], color=colour, label=name, markersize=4)
+    if style[1:]:
+        # With no more changes than a point between two others: the best so far; of a bound, at most the next.
+        steps = "steps-pre" if style == "x--" else "steps-post"
+        axis.plot(changes, np.maximum.accumulate(saving), style[1:], color=colour, drawstyle=steps, linewidth=1.2)
 
 
 def draw_margins(frontiers: Sequence[Frontier], path: Path) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 from iwm_sim.study.report import Column
@@ -63,11 +64,17 @@ def text_table(rows: Sequence[Row], columns: Sequence[Column[Row]] = COLUMNS) ->
 
 
 def plain_table[R](rows: Sequence[R], columns: Sequence[Column[R]]) -> str:
-    """A plain-text table under up to three lines of heading: group, label, unit."""
-    heads = [[column.group for column in columns], [column.label for column in columns], [c.unit for c in columns]]
+    """A plain-text table under up to three lines of heading: group (once over its columns), label, unit."""
+    heads = [[column.label for column in columns], [column.unit for column in columns]]
     lines = [line for line in heads if any(line)] + [[column.shown(row) for column in columns] for row in rows]
     widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
-    return "\n".join(_aligned(line, widths, columns) for line in lines)
+    groups = []
+    for name, members in itertools.groupby(range(len(columns)), lambda i: columns[i].group):
+        own = list(members)
+        widths[own[-1]] += max(len(name) - sum(widths[i] + 2 for i in own) + 2, 0)
+        groups.append(name.center(sum(widths[i] + 2 for i in own) - 2))
+    over = ["  ".join(groups).rstrip()] if any(column.group for column in columns) else []
+    return "\n".join(over + [_aligned(line, widths, columns) for line in lines])
 
 
 def _aligned[R](cells: Sequence[str], widths: Sequence[int], columns: Sequence[Column[R]]) -> str:

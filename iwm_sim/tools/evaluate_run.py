@@ -30,7 +30,7 @@ from iwm_sim.study.plan import Policies
 from iwm_sim.study.policies import PolicySource
 from iwm_sim.study.rows import Row, rows_of
 from iwm_sim.study.study_figures import battery_figure
-from iwm_sim.study.study_tables import ABLATION_NOTE
+from iwm_sim.study.study_tables import ABLATION_NOTE, TABLES
 from iwm_sim.study.tables import plain_table, text_table
 from iwm_sim.study.variants import VARIANTS
 
@@ -219,7 +219,8 @@ def _paper(options: argparse.Namespace) -> None:
     tables = single.paper_table(options.paper, policies, cycles, idle_drives, options.jobs, options.quiet)
     if not options.quiet:
         for table in tables:
-            print(f"{table.title or table.section}\n{plain_table(table.rows, table.columns)}\n")
+            title = table.title if table.section == TABLES else f"{table.section}: {table.title}"
+            print(f"{title}\n{plain_table(table.rows, table.columns)}\n")
         print(f"{table.note}\n{_policies_text(policies)}")
     if options.json:
         rows = [row.to_json() for table in tables for cell in table.rows for row in cell.values()]

@@ -6,7 +6,7 @@ from dataclasses import replace
 from iwm_sim.metrics import Metrics
 from iwm_sim.study.report import Column
 from iwm_sim.study.rows import Place, Row
-from iwm_sim.study.tables import markdown_table, text_table
+from iwm_sim.study.tables import markdown_table, plain_table, text_table
 
 METRICS = Metrics(**dict.fromkeys(Metrics._fields, 0.0))._replace(wh_per_km=104.456, trace_held=True)
 ROW = Row(Place("nycc", 0.9, "none"), "sdp", "sdp", METRICS, -1.456, None, True)
@@ -38,3 +38,17 @@ def test_markdown_escapes_what_would_break_a_table():
     columns = [Column("Name", lambda row: row[0]), Column("here", lambda row: row[1], "W", 1, group="Value")]
     text = markdown_table([("a|b", 1.0)], columns)
     assert text.splitlines() == ["| Name | Value here, W |", "| --- | ---: |", "| a\\|b | 1.0 |"]
+
+
+def test_a_group_stands_once_over_its_columns():
+    columns = [
+        Column("name", lambda row: row[0]),
+        *(Column(label, lambda row: row[1], "%", 1, group="saved here") for label in ("a", "b", "c")),
+        Column("d", lambda row: row[1], "%", 1, group="as printed there"),
+    ]
+    assert plain_table([("x", 1.0)], columns).splitlines() == [
+        "        saved here   as printed there",
+        "name    a    b    c                 d",
+        "        %    %    %                 %",
+        "x     1.0  1.0  1.0               1.0",
+    ]
