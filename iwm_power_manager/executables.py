@@ -21,6 +21,13 @@ from iwm_power_manager.exit_codes import DONE, INTERRUPTED
 ASK_ONLY = frozenset({"-h", "--help", "--version"})
 
 
+def leave(module: str, interrupted: int) -> int:
+    """`run`; where it has used DDS, the interpreter's own end is bounded in time as well."""
+    code = run(module, interrupted)
+    ending = sys.modules.get("iwm_power_manager.ros.ending")
+    return ending.at_exit(code) if ending is not None else code
+
+
 def run(module: str, interrupted: int) -> int:
     """Import a module and run its `main`.
 
@@ -76,11 +83,11 @@ def _ended(module: str, interrupted: int) -> int:
             signal.signal(number, signal.SIG_IGN)
 
 
-import_cycle = partial(run, "iwm_power_manager.tools.import_cycle", INTERRUPTED)
-import_motor = partial(run, "iwm_power_manager.tools.import_motor", INTERRUPTED)
-power_manager = partial(run, "iwm_power_manager.nodes.power_manager", DONE)
-recorder = partial(run, "iwm_power_manager.nodes.recorder", DONE)
-replay = partial(run, "iwm_power_manager.tools.replay", INTERRUPTED)
-set_parameter = partial(run, "iwm_power_manager.tools.set_parameter", INTERRUPTED)
-solve_policy = partial(run, "iwm_power_manager.tools.solve_policy", INTERRUPTED)
-watch_car = partial(run, "iwm_power_manager.tools.watch_car", INTERRUPTED)
+import_cycle = partial(leave, "iwm_power_manager.tools.import_cycle", INTERRUPTED)
+import_motor = partial(leave, "iwm_power_manager.tools.import_motor", INTERRUPTED)
+power_manager = partial(leave, "iwm_power_manager.nodes.power_manager", DONE)
+recorder = partial(leave, "iwm_power_manager.nodes.recorder", DONE)
+replay = partial(leave, "iwm_power_manager.tools.replay", INTERRUPTED)
+set_parameter = partial(leave, "iwm_power_manager.tools.set_parameter", INTERRUPTED)
+solve_policy = partial(leave, "iwm_power_manager.tools.solve_policy", INTERRUPTED)
+watch_car = partial(leave, "iwm_power_manager.tools.watch_car", INTERRUPTED)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.timer import Timer
 
+from iwm_power_manager.exit_codes import DONE
+from iwm_power_manager.ros import ending
 from iwm_power_manager.ros.interruption import Interruption
 
 if TYPE_CHECKING:
@@ -42,5 +44,6 @@ def spin(node: PowerManager, interruption: Interruption) -> None:
             executor.spin_once(timeout_sec=0.0 if node.step_when_due() else None)
         except Exception as error:  # noqa: BLE001 - whatever it is, the motors must not be left with a command
             node.fail(f"{type(error).__name__}: {error}")
-    node.stop()
-    executor.shutdown()
+    with ending.deadline(DONE):  # the command is out at once; what DDS does after it may take for ever
+        node.stop()
+        executor.shutdown()

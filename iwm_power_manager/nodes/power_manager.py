@@ -90,4 +90,6 @@ def _run(interruption: Interruption, args: list[str] | None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from iwm_power_manager.ros import ending
+
+    sys.exit(ending.at_exit(main()))

@@ -460,4 +460,4 @@ def _record(node: Recorder, interruption: Interruption) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(ending.at_exit(main()))

@@ -69,7 +69,8 @@ def bounded(code: int, limit_s: float | None = None) -> Iterator[None]:
         sys.stdout.flush()
     sys.stderr.flush()
     realtime.give_up_priority()
-    with _deadline(code, LIMIT_S if limit_s is None else limit_s), one_processor():
+    limit_s = LIMIT_S if limit_s is None else limit_s
+    with deadline(code, limit_s), one_processor():
         try:
             yield
         finally:
@@ -80,7 +81,29 @@ def bounded(code: int, limit_s: float | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def _deadline(code: int, limit_s: float) -> Iterator[None]:
+def deadline(code: int, limit_s: float = LIMIT_S) -> Iterator[None]:
+    """End the process with an exit code if the body of the `with` takes longer."""
+    timer = _start_timer(code, limit_s)
+    try:
+        yield
+    finally:
+        if timer is not None:
+            ctypes.CDLL(None).timer_delete(timer)
+
+
+def at_exit(code: int) -> int:
+    """What ends a process: the interpreter's own end, with what compiled libraries do in it, is bounded as well.
+
+    Returns
+    -------
+    int
+        The same exit code, for `sys.exit`.
+    """
+    _start_timer(code, LIMIT_S)
+    return code
+
+
+def _start_timer(code: int, limit_s: float) -> ctypes.c_void_p | None:
     """Timer of the C library, whose thread calls `_exit`: no Python needed, since its lock may never be free again."""
     libc = ctypes.CDLL(None, use_errno=True)
     event = _Event(notify=_SIGEV_THREAD, function=ctypes.cast(libc._exit, ctypes.c_void_p))
@@ -88,14 +111,10 @@ def _deadline(code: int, limit_s: float) -> Iterator[None]:
     timer = ctypes.c_void_p()
     if libc.timer_create(_CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) != 0:
         print(f"cannot bound the time of leaving DDS: {os.strerror(ctypes.get_errno())}", file=sys.stderr)
-        yield
-        return
+        return None
     seconds, rest = divmod(limit_s, 1.0)
     libc.timer_settime(timer, 0, ctypes.byref(_Time(value_s=int(seconds), value_ns=int(rest * 1e9))), None)
-    try:
-        yield
-    finally:
-        libc.timer_delete(timer)
+    return timer
 
 
 @contextmanager

@@ -22,6 +22,15 @@ with ending.bounded({code}, 0.3):
     ctypes.PyDLL(None).pause()
 """
 
+#: The same at the interpreter's end.
+STUCK_AT_EXIT = """
+import atexit, ctypes, sys
+from iwm_power_manager.ros import ending
+atexit.register(ctypes.PyDLL(None).pause)
+ending.LIMIT_S = 0.3
+sys.exit(ending.at_exit({code}))
+"""
+
 #: Runs a node's `main` and tells which threads of DDS it leaves to the interpreter's end.
 REMAINS = """
 import importlib, os, sys
@@ -38,8 +47,9 @@ def run(code: str, *args: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("code", [0, 1])
 def test_a_destructor_that_never_returns_does_not_keep_the_process(code) -> None:
-    ended = run(STUCK.format(code=code))
-    assert (ended.returncode, ended.stdout, ended.stderr) == (code, "", "")
+    for program in (STUCK, STUCK_AT_EXIT):
+        ended = run(program.format(code=code))
+        assert (ended.returncode, ended.stdout, ended.stderr) == (code, "", "")
 
 
 #: Goes on for longer than leaving may take: nothing to wait for, it is the timer that must not come.
@@ -121,10 +131,10 @@ def test_priority_is_given_up_and_processors_shared_before_dds_is_left() -> None
 @pytest.mark.parametrize(
     ("module", "parameters", "code"),
     [
-        ("iwm_power_manager.nodes.power_manager", {"policy_file": ""}, 1),  # there is a node, it does not start
-        ("iwm_power_manager.nodes.power_manager", {"rate_hz": 1e6}, 1),  # there is half a node
-        ("iwm_power_manager.nodes.recorder", {"output": "/proc/nowhere/bag"}, 1),
-        ("iwm_sim.simulator", {"cycle_file": "/nowhere.csv"}, 1),
+        ("iwm_power_manager.nodes.power_manager", {"policy_file": ""}, 2),  # there is a node, it does not start
+        ("iwm_power_manager.nodes.power_manager", {"rate_hz": 1e6}, 2),  # there is half a node
+        ("iwm_power_manager.nodes.recorder", {"output": "/proc/nowhere/bag"}, 2),
+        ("iwm_sim.simulator", {"cycle_file": "/nowhere.csv"}, 2),
     ],
 )
 def test_a_node_that_cannot_start_leaves_no_dds_to_the_end_of_the_interpreter(module, parameters, code) -> None:
