@@ -19,6 +19,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from iwm_power_manager.control.types import LIMIT_BATTERY_CHARGE, LIMIT_BATTERY_DISCHARGE, LIMIT_NAMES
+
 #: Modes of the power manager, in the order of `MODE_NAMES`.
 MODE_WAITING, MODE_NORMAL, MODE_DEGRADED, MODE_RECOVERING = range(4)
 MODE_NAMES = ("waiting", "normal", "degraded", "recovering")
@@ -74,6 +76,21 @@ class Supervision(NamedTuple):
 
 #: State in which everything is allowed from the first step on: lock-step, where inputs cannot go missing.
 LOCKSTEP_SUPERVISION = Supervision(mode=MODE_NORMAL, motor_factor=1.0)
+
+
+def binding_limits(limits: int, motor_factor: float) -> list[str]:
+    """Names of the limits that bind.
+
+    Motors are faded by way of what the battery may give and take. Where nothing of it is left, it is not the battery.
+
+    Parameters
+    ----------
+    limits : bits of `LIMIT_NAMES`
+    motor_factor : part of the motor torque that is allowed, 0..1
+    """
+    faded = LIMIT_BATTERY_DISCHARGE | LIMIT_BATTERY_CHARGE if motor_factor == 0.0 else 0
+    names = [name for bit, name in LIMIT_NAMES.items() if limits & ~faded & bit]
+    return [*names, "motors faded out"] if limits & faded else names
 
 
 def stale_inputs(age_s: tuple[float, float, float, float], limit_s: tuple[float, float, float, float]) -> int:

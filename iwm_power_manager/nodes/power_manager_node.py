@@ -34,6 +34,7 @@ from iwm_power_manager.nodes.preparation import Prepared
 from iwm_power_manager.nodes.starting import Starting
 from iwm_power_manager.ros import diagnostics, messages, realtime
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
+from iwm_power_manager.signals.commands import FRICTION
 
 #: How often, and how far apart, the rest of a set is looked for once its demand is there; later the watchdog looks.
 _SET_PATIENCE = 20
@@ -85,7 +86,7 @@ class PowerManager(Starting):
         self._unheard: dict[str, str] = {}
         self._says = Announcements(self.get_logger())
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._report = PowerManagerReport(self.get_fully_qualified_name(), self._wheel_names, None)
+        self._report = PowerManagerReport(self.get_fully_qualified_name(), self._wheel_names, None, {})
         self._report_due = False
         self._changes = ChangeDetector(_CHANGE_PERIOD_S)
         self.create_timer(_REPORT_PERIOD_S, self._on_report_timer)
@@ -191,7 +192,9 @@ class PowerManager(Starting):
             path, period_s = Path(values["demand_log"]), values["demand_log_period_s"]
             self._demand_log = DemandLog(path, period_s, self._controller.policy, prepared.vehicle.params)
         rate_hz = None if self._lockstep else values["rate_hz"]
-        self._report = PowerManagerReport(self.get_fully_qualified_name(), self._wheel_names, rate_hz)
+        brakes = "commanded" if prepared.mapping.commands[FRICTION] else "another system"
+        car = {"vehicle": prepared.vehicle.name, "friction brakes": brakes}
+        self._report = PowerManagerReport(self.get_fully_qualified_name(), self._wheel_names, rate_hz, car)
 
     def _release(self) -> None:
         for entities in (self._inputs, self._outputs):
@@ -301,7 +304,9 @@ class PowerManager(Starting):
             if self._answer is not None:
                 self._outputs.publish(self._answer)
             return
-        if self._controller is not None and (stale := self._controller.supervision.stale):
+        assert self._controller is not None
+        supervision = self._controller.supervision
+        if stale := supervision.stale:
             self._says.late(stale, self._controller.monitor.ages_s(taken.stamp_ns))
         self._answer = self._outputs.answer(taken.stamp_ns, taken.step)
         if isinstance(self._stepper, RealTime):
@@ -311,7 +316,8 @@ class PowerManager(Starting):
             self._outputs.publish(self._answer)
         if self._demand_log:
             self._demand_log.note(taken.stamp_ns, taken.step.values)
-        self._report.note_step(taken.step.command, taken.since_s, time.perf_counter() - started_s)
+        elapsed_s = time.perf_counter() - started_s
+        self._report.note_step(taken.step.command, supervision.motor_factor, taken.since_s, elapsed_s)
 
     # Parameters
 

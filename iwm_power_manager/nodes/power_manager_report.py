@@ -10,8 +10,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 
 from iwm_power_manager.control.controller import Controller
-from iwm_power_manager.control.supervision import Supervision
-from iwm_power_manager.control.types import GATE_NONE, LIMIT_NAMES, Command
+from iwm_power_manager.control.supervision import Supervision, binding_limits
+from iwm_power_manager.control.types import GATE_NONE, Command
 from iwm_power_manager.ros import diagnostics
 
 #: Fewer steps since the last report do not say whether a sensor is believed.
@@ -21,15 +21,24 @@ _FEW_STEPS = 5
 class PowerManagerReport:
     """Counts steps, gates and limits; turns them and the node's present state into diagnostics.
 
+    Parameters
+    ----------
+    node_name, wheel_names : in full; in their order
+    rate_hz : of the control loop; None without one
+    car : what is said of the car, by key
+
     Attributes
     ----------
     doubts : what the last report said of sensors that are not believed, for the log
     """
 
-    def __init__(self, node_name: str, wheel_names: Sequence[str], rate_hz: float | None) -> None:
+    def __init__(
+        self, node_name: str, wheel_names: Sequence[str], rate_hz: float | None, car: Mapping[str, str]
+    ) -> None:
         self._node_name = node_name
         self._wheel_names = wheel_names
         self._rate_hz = rate_hz
+        self._car = car
         self._loop = diagnostics.LoopStatistics()
         self._inputs = diagnostics.InputReport()
         self._activity: Counter[str] = Counter()
@@ -37,7 +46,7 @@ class PowerManagerReport:
         self._doubted: Counter[int] = Counter()
         self.doubts: list[str] = []
 
-    def note_step(self, command: Command, period_s: float | None, execution_s: float) -> None:
+    def note_step(self, command: Command, motor_factor: float, period_s: float | None, execution_s: float) -> None:
         """Count one step of the active node."""
         self._loop.add(period_s, execution_s)
         self._steps += 1
@@ -45,7 +54,7 @@ class PowerManagerReport:
         if command.gate != GATE_NONE:
             self._activity["gate"] += 1
         if command.limits:
-            self._activity.update(name for bit, name in LIMIT_NAMES.items() if command.limits & bit)
+            self._activity.update(binding_limits(command.limits, motor_factor))
 
     def message(
         self,
@@ -75,6 +84,7 @@ class PowerManagerReport:
                 command.limits if command else 0,
                 self._activity,
                 values["strategy"],
+                self._car,
             )
         )
         if lifecycle == "active" and controller:

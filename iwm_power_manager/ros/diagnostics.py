@@ -17,8 +17,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from iwm_power_manager.control.actuators import ActuatorState, MotorVerdict
 from iwm_power_manager.control.inputs import Violation, WheelVerdict
 from iwm_power_manager.control.monitor import Tally
-from iwm_power_manager.control.supervision import MODE_NAMES, MODE_NORMAL, STALE_NAMES, Supervision
-from iwm_power_manager.control.types import GATE_NAMES, LIMIT_NAMES
+from iwm_power_manager.control.supervision import MODE_NAMES, MODE_NORMAL, STALE_NAMES, Supervision, binding_limits
+from iwm_power_manager.control.types import GATE_NAMES
 from iwm_power_manager.ros.messages import ns_to_stamp
 
 OK, WARN, ERROR, STALE = range(4)
@@ -180,20 +180,26 @@ class InputReport:
 
 
 def control_status(
-    lifecycle: str, supervision: Supervision, gate: int, limits: int, activity: Mapping[str, int], strategy: str
+    lifecycle: str,
+    supervision: Supervision,
+    gate: int,
+    limits: int,
+    activity: Mapping[str, int],
+    strategy: str,
+    car: Mapping[str, str],
 ) -> Status:
-    """What the control does: lifecycle state, mode and its reason, gate, limits that bind, how often they did."""
+    """What the control does: lifecycle state, mode and its reason, gate, limits and how often they bind; the car."""
     mode = MODE_NAMES[supervision.mode]
     missing = [name for bit, name in STALE_NAMES.items() if supervision.stale & bit]
-    binding = [name for bit, name in LIMIT_NAMES.items() if limits & bit]
     values = {
         "lifecycle": lifecycle,
         "mode": mode,
         "degraded reason": f"missing: {', '.join(missing)}" if missing else "none",
         "motor torque allowed (%)": f"{100.0 * supervision.motor_factor:.0f}",
         "strategy": strategy,
+        **car,
         "gate": GATE_NAMES[gate],
-        "limits that bind": ", ".join(binding) or "none",
+        "limits that bind": ", ".join(binding_limits(limits, supervision.motor_factor)) or "none",
         **{f"{name}: steps since the last report": str(count) for name, count in activity.items()},
     }
     if lifecycle != "active":

@@ -7,19 +7,22 @@ Charts and server are Bokeh's, whose scripts come from the same server: no netwo
 from __future__ import annotations
 
 import argparse
+import html
 import importlib.util
 import itertools
+import logging
 import re
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
 from iwm_power_manager.command_line import CommandParser
-from iwm_power_manager.control.supervision import MODE_NAMES, STALE_NAMES
-from iwm_power_manager.control.types import GATE_NAMES, LIMIT_NAMES, WHEEL_NAMES
+from iwm_power_manager.control.supervision import MODE_NAMES, MODE_NORMAL, STALE_NAMES, binding_limits
+from iwm_power_manager.control.types import GATE_NAMES, WHEEL_NAMES
 from iwm_power_manager.errors import FailedError, IwmError
 from iwm_power_manager.exit_codes import DONE, FAILED
 from iwm_power_manager.signals.contract import DIAGNOSTICS, POWER_MANAGER_STATE
@@ -31,9 +34,70 @@ POINTS = 1500
 #: One step of so many is drawn; the page takes what is new this often.
 EVERY = 5
 REFRESH_MS = 200
-LEVELS = ("ok", "warn", "error", "stale")
 _NAN = float("nan")
-_COLORS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377")
+_TEMPLATE = """\
+{% block preamble %}<meta name="viewport" content="width=device-width, initial-scale=1">{% endblock %}
+"""
+#: Without a step for so long, it is said.
+QUIET_S = 1.0
+LEVELS = ("ok", "warn", "error", "stale")
+_LEVEL_COLORS = {"ok": "transparent", "warn": "#ffe08a", "error": "#f4a6a6", "stale": "#d0d0d0"}
+_FRONT, _REAR = "#4477aa", "#ee6677"
+#: Left and right wheels mostly do the same: the right one is dashes of another colour upon the left one's line.
+_WHEEL_LINES = dict(
+    zip(
+        WHEEL_NAMES,
+        ((_FRONT, "solid"), ("#002255", "dashed"), (_REAR, "solid"), ("#881122", "dashed")),
+        strict=True,
+    )
+)
+
+
+class Line(NamedTuple):
+    """A signal of the state in a chart."""
+
+    label: str
+    signal: str
+    color: str
+    dash: str = "solid"
+    width: float = 2.0
+
+
+class Chart(NamedTuple):
+    """A chart: its title with the unit, its lines, and what its axis shows at least."""
+
+    title: str
+    lines: tuple[Line, ...]
+    least: tuple[float, float]
+
+
+def _wheels(signal: str) -> tuple[Line, ...]:
+    return tuple(Line(wheel.replace("_", " "), f"{wheel}_{signal}", *look) for wheel, look in _WHEEL_LINES.items())
+
+
+BRAKES = Chart("friction brake torque, N m", _wheels("friction_torque_nm"), (-10.0, 0.0))
+CHARTS = (
+    Chart(
+        "speed, m/s",
+        (Line("sensor", "speed_mps", _REAR, width=0.8), Line("believed", "estimated_speed_mps", _FRONT)),
+        (0.0, 1.0),
+    ),
+    Chart(
+        "power demand, W",
+        (Line("asked", "requested_power_w", _REAR, width=0.8), Line("used", "power_demand_w", _FRONT)),
+        (-100.0, 100.0),
+    ),
+    Chart(
+        "front share",
+        (Line("decided", "decided_share", _REAR, width=0.8), Line("applied", "front_share", _FRONT)),
+        (0.0, 1.0),
+    ),
+    Chart("motor torque, N m", _wheels("motor_torque_nm"), (-10.0, 10.0)),
+    BRAKES,
+    Chart("slip", (Line("front", "front_slip", _FRONT), Line("rear", "rear_slip", _REAR)), (-0.05, 0.05)),
+    Chart("motor torque allowed, 0..1", (Line("factor", "motor_factor", _FRONT),), (0.0, 1.0)),
+)
+_SIGNALS = sorted({line.signal for chart in CHARTS for line in chart.lines})
 
 
 class Row(NamedTuple):
@@ -44,29 +108,54 @@ class Row(NamedTuple):
 
 
 class Feed:
-    """What the topics have said last; filled by the executor's thread, read by the pages."""
+    """What the topics have said last; filled by the executor's thread, read by the pages.
+
+    Attributes
+    ----------
+    topic : full name of the state's topic
+    car : the vehicle's name; "" as long as the node has not said it
+    foreign_brakes : the node says that another system has the friction brakes
+    """
 
     def __init__(self) -> None:
         self.rows: deque[Row] = deque(maxlen=KEPT)
-        self.names: tuple[str, ...] = ()
         self.statuses: dict[str, tuple[str, str]] = {}
+        self.topic = f"/{POWER_MANAGER_STATE}"
+        self.car = ""
+        self.foreign_brakes = False
         self._heard = 0
+        self._heard_s = time.monotonic()
         self._first_s: float | None = None
 
     def state(self, stamp_ns: int, values: Mapping[str, float]) -> None:
         """Take one step of the power manager."""
         self._heard += 1
+        self._heard_s = time.monotonic()
         if self._heard % EVERY:
             return
         time_s = stamp_ns * 1e-9
         if self._first_s is None:
             self._first_s = time_s
-        self.names = tuple(values)
         self.rows.append(Row(self._heard // EVERY, {"time_s": time_s - self._first_s, **values}))
 
-    def status(self, name: str, level: int, message: str) -> None:
+    def status(self, name: str, level: int, message: str, values: Mapping[str, str] | None = None) -> None:
         """Take one status of `/diagnostics`."""
-        self.statuses[name] = (LEVELS[level], message)
+        self.statuses[name] = (LEVELS[min(level, len(LEVELS) - 1)], message)
+        if values and name == f"{self.node}: control":
+            self.car = values.get("vehicle", "")
+            self.foreign_brakes = values.get("friction brakes") == "another system"
+
+    @property
+    def node(self) -> str:
+        """Full name of the node."""
+        return self.topic.rpartition("/")[0]
+
+    def silence(self) -> str:
+        """What is waited for; "" while steps come."""
+        silent_s = time.monotonic() - self._heard_s
+        if not self.rows:
+            return f"waiting for {self.topic} ({silent_s:.0f} s)"
+        return f"nothing new on {self.topic} for {silent_s:.0f} s" if silent_s > QUIET_S else ""
 
     def since(self, number: int) -> list[Row]:
         """Steps after that one, oldest first."""
@@ -76,60 +165,94 @@ class Feed:
 
 def in_words(values: Mapping[str, float]) -> list[str]:
     """Mode, gate, limits and missing inputs of a step, and its main numbers."""
-    limits = [name for bit, name in LIMIT_NAMES.items() if int(values["limits"]) & bit]
+    limits = binding_limits(int(values["limits"]), values["motor_factor"])
     missing = [name for bit, name in STALE_NAMES.items() if int(values["stale"]) & bit]
+    speed = f"speed {values['speed_mps']:.2f} m/s"
+    if int(values.get("doubted", 0.0)) & 1 << len(WHEEL_NAMES):
+        speed = f"speed {values['estimated_speed_mps']:.2f} m/s (sensor not believed: {values['speed_mps']:.2f} m/s)"
     return [
         f"mode: {MODE_NAMES[int(values['mode'])]}",
         f"gate: {GATE_NAMES[int(values['gate'])]}",
         f"limits that bind: {', '.join(limits) or 'none'}",
         f"missing: {', '.join(missing) or 'nothing'}",
-        f"speed {values['speed_mps']:.2f} m/s",
+        speed,
         f"demand {values['power_demand_w'] / 1e3:.2f} kW",
         f"front share {values['front_share']:.2f}",
         f"charge {100.0 * values['soc']:.1f} %",
     ]
 
 
-def charts(names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """Title of each chart, and its lines: signal by label."""
-    slips = {name.removesuffix("_slip"): name for name in names if name.endswith("_slip") and "." not in name}
-    return {
-        "speed, m/s": {"car": "speed_mps"},
-        "power demand, W": {"asked": "requested_power_w", "used": "power_demand_w"},
-        "front share": {"applied": "front_share", "decided": "decided_share"},
-        "motor torque, N m": {wheel: f"{wheel}_motor_torque_nm" for wheel in WHEEL_NAMES},
-        "friction brake torque, N m": {wheel: f"{wheel}_friction_torque_nm" for wheel in WHEEL_NAMES},
-        "slip": slips,
-        "motor torque allowed, 0..1": {"factor": "motor_factor"},
-    }
+def last_words(feed: Feed) -> list[str]:
+    """The last step in words, and before it that there is none, or has been none for long."""
+    rows = list(feed.rows)
+    return [*filter(None, [feed.silence()]), *(in_words(rows[-1].values) if rows else [])]
+
+
+def heading_html(feed: Feed) -> str:
+    """Node and car, and the last step in words; coloured where it is not normal."""
+    rows = list(feed.rows)
+    normal = rows and int(rows[-1].values["mode"]) == MODE_NORMAL and not feed.silence()
+    color = _LEVEL_COLORS["ok" if normal else "warn"]
+    words = " &nbsp;·&nbsp; ".join(map(html.escape, last_words(feed)))
+    title = " · ".join(filter(None, [feed.node, feed.car]))
+    return f'<b>{html.escape(title)}</b><div style="background:{color}; padding:2px">{words}</div>'
+
+
+def statuses_html(feed: Feed) -> str:
+    """The diagnostics as a table; a row has the colour of its level."""
+    rows = "".join(
+        f'<tr style="background:{_LEVEL_COLORS[level]}"><td>{level}<td>{html.escape(name)}<td>{html.escape(message)}'
+        for name, (level, message) in sorted(feed.statuses.items())
+    )
+    return f'<table style="text-align:left; overflow-wrap:anywhere"><tr><th>level<th>name<th>message{rows}</table>'
+
+
+def _figure(chart: Chart, state: Any, x_range: Any) -> Any:
+    """A chart whose legend stands above it, not upon the curves."""
+    from bokeh.models import DataRange1d
+    from bokeh.plotting import figure
+
+    y_range = DataRange1d()
+    drawn = figure(
+        title=chart.title,
+        x_axis_label="time (s)",
+        height=240,
+        sizing_mode="stretch_width",
+        tools="pan,wheel_zoom,reset",
+        toolbar_location="above",
+        x_range=x_range,
+        y_range=y_range,
+    )
+    drawn.toolbar.logo = None
+    for label, signal, color, dash, width in chart.lines:
+        drawn.line("time_s", signal, source=state, legend_label=label, color=color, line_dash=dash, line_width=width)
+    if isinstance(x_range.renderers, str):  # the curves make the range, not what holds the other axis open
+        x_range.renderers = list(drawn.renderers)
+    drawn.line([0.0, 0.0], list(chart.least), line_alpha=0.0)
+    legend = drawn.legend[0]
+    legend.orientation, legend.label_text_font_size = "horizontal", "9pt"
+    legend.margin, legend.spacing = 0, 12
+    legend.border_line_alpha, legend.visible = 0.0, len(chart.lines) > 1
+    drawn.add_layout(legend, "above")
+    return drawn
 
 
 def make_page(document: Any, feed: Feed) -> None:
     """Fill a browser's document, and keep it filled."""
-    from bokeh.layouts import column, gridplot
+    from bokeh.layouts import column, row
+    from bokeh.models import DataRange1d
     from bokeh.models.sources import ColumnDataSource
-    from bokeh.models.widgets import DataTable, Div, TableColumn
-    from bokeh.plotting import figure
+    from bokeh.models.widgets import Div
 
-    lines = charts(feed.names)
-    signals = sorted({signal for drawn in lines.values() for signal in drawn.values()})
-    state = ColumnDataSource({name: [] for name in ("time_s", *signals)}, name="state")
-    words = Div(text="nothing heard yet", name="words")
-    table = ColumnDataSource({"level": [], "name": [], "message": []}, name="diagnostics")
-    figures: list[Any] = []
-    for title, drawn in lines.items():
-        shared = {"x_range": figures[0].x_range} if figures else {}
-        chart = figure(title=title, height=220, width=560, tools="pan,wheel_zoom,reset", **shared)
-        for color, (label, signal) in zip(_COLORS, drawn.items(), strict=False):
-            chart.line("time_s", signal, source=state, legend_label=label, color=color)
-        chart.legend.label_text_font_size = "8pt"
-        chart.legend.visible = len(drawn) > 1
-        figures.append(chart)
-    widths = {"level": 60, "name": 260, "message": 780}
-    columns = [TableColumn(field=field, title=field, width=width) for field, width in widths.items()]
-    statuses = DataTable(source=table, columns=columns, width=1120, height=240, index_position=None)
-    document.title = "power manager"
-    document.add_root(column(words, gridplot(figures, ncols=2, merge_tools=False), statuses))
+    state = ColumnDataSource({name: [] for name in ("time_s", *_SIGNALS)}, name="state")
+    words = Div(name="words", sizing_mode="stretch_width")
+    table = Div(name="diagnostics", sizing_mode="stretch_width")
+    x_range = DataRange1d()
+    figures = {chart: _figure(chart, state, x_range) for chart in CHARTS}
+    columns = {"display": "grid", "grid-template-columns": "repeat(auto-fit, minmax(340px, 1fr))"}
+    charts = row(*figures.values(), sizing_mode="stretch_width", styles=columns)
+    document.template = _TEMPLATE
+    document.add_root(column(words, table, charts, sizing_mode="stretch_width"))
     seen = 0
 
     def refresh() -> None:
@@ -137,18 +260,18 @@ def make_page(document: Any, feed: Feed) -> None:
         rows = feed.since(seen)
         if rows:
             seen = rows[-1].number
-            words.text = " &nbsp;·&nbsp; ".join(in_words(rows[-1].values))
             found: dict[str, Any] = {
-                name: [row.values.get(name, float("nan")) for row in rows] for name in ("time_s", *signals)
+                name: [row.values.get(name, _NAN) for row in rows] for name in ("time_s", *_SIGNALS)
             }
             state.stream(found, rollover=POINTS)
-        shown = sorted(feed.statuses.items())
-        table.data = {
-            "level": [level for _, (level, _) in shown],
-            "name": [name for name, _ in shown],
-            "message": [message for _, (_, message) in shown],
-        }
+        document.title = " · ".join(filter(None, [feed.node, feed.car]))
+        words.text, table.text = heading_html(feed), statuses_html(feed)
+        brakes = figures[BRAKES]
+        brakes.title.text = "friction brakes: another system has them" if feed.foreign_brakes else BRAKES.title
+        for shown in (*brakes.renderers, *brakes.legend):
+            shown.visible = not feed.foreign_brakes
 
+    refresh()
     document.add_periodic_callback(refresh, REFRESH_MS)
 
 
@@ -165,6 +288,7 @@ def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread,
 
     rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     node = Node("watch_car", enable_rosout=False, start_parameter_services=False)
+    feed.topic = node.resolve_topic_name(POWER_MANAGER_STATE)
     asked = qos.profile(lockstep=False, depth=100, reliability="best_effort")
     node.create_subscription(
         JointState, POWER_MANAGER_STATE, lambda message: feed.state(*messages.read_named_numbers(message)), asked
@@ -177,7 +301,8 @@ def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread,
         for status in message.status:
             if not status.name.startswith(of_this_car):
                 continue
-            feed.status(status.name, status.level[0], status.message)
+            values = {entry.key: entry.value for entry in status.values}
+            feed.status(status.name, status.level[0], status.message, values)
 
     node.create_subscription(DiagnosticArray, DIAGNOSTICS, diagnosed, asked)
     executor = SingleThreadedExecutor()
@@ -200,6 +325,8 @@ def serve(feed: Feed, port: int, *, open_browser: bool) -> None:
     from bokeh.application.handlers import FunctionHandler
     from bokeh.server.server import Server
 
+    # A closed tab is no news.
+    logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
     application = Application(FunctionHandler(lambda document: make_page(document, feed)))
     try:
         server = Server({"/": application}, address="127.0.0.1", port=port)
@@ -219,8 +346,7 @@ def serve(feed: Feed, port: int, *, open_browser: bool) -> None:
 
 def report(feed: Feed) -> str:
     """What there is to say in a terminal: one line of the last step, one for each status that is not ok."""
-    rows = list(feed.rows)
-    lines = [" | ".join(in_words(rows[-1].values)) if rows else "nothing heard yet"]
+    lines = [" | ".join(last_words(feed))]
     lines += [
         f"  {level:5} {name}: {text}" for name, (level, text) in sorted(feed.statuses.items()) if level != LEVELS[0]
     ]

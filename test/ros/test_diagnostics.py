@@ -127,28 +127,38 @@ class TestInputs:
         assert status.values["wheel front_right"] == "stuck"
 
 
+CAR = {"vehicle": "van"}
+
+
 class TestControl:
     def test_normal_operation_is_ok_and_tells_what_binds(self) -> None:
         supervision = Supervision(MODE_NORMAL, 0, 1.0, 1.0, 1.0)
-        status = control_status("active", supervision, 2, 2 | 32, {"gate": 7}, "sdp")
+        status = control_status("active", supervision, 2, 2 | 32, {"gate": 7}, "sdp", CAR)
         assert (status.level, status.message) == (OK, "normal")
         assert status.values["gate"] == "rear"
         assert status.values["limits that bind"] == "regeneration, slew"
         assert status.values["gate: steps since the last report"] == "7"
         assert status.values["degraded reason"] == "none"
+        assert status.values["vehicle"] == "van"
+
+    def test_a_faded_motor_is_not_put_down_to_the_battery(self) -> None:
+        for factor, words in ((0.0, "motor, motors faded out"), (0.5, "motor, battery_discharge")):
+            supervision = Supervision(MODE_DEGRADED, STALE_DEMAND, factor, 1.0, 0.0)
+            status = control_status("active", supervision, 0, 1 | 4, {}, "sdp", CAR)
+            assert status.values["limits that bind"] == words
 
     def test_degraded_is_an_error_with_its_reason(self) -> None:
         supervision = Supervision(MODE_DEGRADED, STALE_DEMAND, 0.25, 1.0, 0.0)
-        status = control_status("active", supervision, 0, 0, {}, "sdp")
+        status = control_status("active", supervision, 0, 0, {}, "sdp", CAR)
         assert (status.level, status.message) == (ERROR, "degraded: power_demand missing")
         assert status.values["motor torque allowed (%)"] == "25"
 
     def test_recovering_is_a_warning(self) -> None:
-        status = control_status("active", Supervision(MODE_RECOVERING, 0, 0.5, 1.0, 1.0), 0, 0, {}, "sdp")
+        status = control_status("active", Supervision(MODE_RECOVERING, 0, 0.5, 1.0, 1.0), 0, 0, {}, "sdp", CAR)
         assert (status.level, status.message) == (WARN, "recovering")
 
     def test_a_node_that_is_not_active_is_ok_and_says_what_it_is(self) -> None:
-        status = control_status("inactive", Supervision(), 0, 0, {}, "sdp")
+        status = control_status("inactive", Supervision(), 0, 0, {}, "sdp", CAR)
         assert (status.level, status.message) == (OK, "inactive")
 
 

@@ -17,7 +17,7 @@ import pytest
 
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.tools import watch_car
-from iwm_power_manager.tools.watch_car import EVERY, Feed, charts, in_words
+from iwm_power_manager.tools.watch_car import CHARTS, EVERY, Feed, heading_html, in_words, statuses_html
 
 ROOT = Path(__file__).resolve().parents[2]
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -62,9 +62,32 @@ def test_mode_gate_limits_and_missing_inputs_stand_in_words() -> None:
     assert "limits that bind: none" in in_words(values())
 
 
+def test_a_faded_motor_is_not_put_down_to_the_battery() -> None:
+    assert "limits that bind: motors faded out" in in_words(values(limits=4.0, motor_factor=0.0))
+    assert "limits that bind: battery_discharge" in in_words(values(limits=4.0, motor_factor=1.0))
+
+
+def test_where_the_sensor_is_not_believed_the_speed_is_the_believed_one() -> None:
+    given = {"speed_mps": 36.0, "estimated_speed_mps": 10.0}
+    assert "speed 36.00 m/s" in in_words(values(**given))
+    assert "speed 10.00 m/s (sensor not believed: 36.00 m/s)" in in_words(values(**given, doubted=16.0))
+
+
+def test_the_page_names_node_and_car_and_colours_what_is_not_well() -> None:
+    feed = Feed()
+    feed.topic = "/a/power_manager/state"
+    feed.status("/a/power_manager: control", 2, "<b>bad", {"vehicle": "van", "friction brakes": "another system"})
+    feed.status("/b/power_manager: control", 0, "well", {"vehicle": "other", "friction brakes": "commanded"})
+    assert (feed.car, feed.foreign_brakes) == ("van", True)
+    assert "<b>/a/power_manager · van</b>" in heading_html(feed)
+    bad, well = statuses_html(feed).split("<tr")[2:]
+    assert "#" in bad and "&lt;b&gt;bad" in bad
+    assert "transparent" in well
+
+
 def test_the_terminal_gets_the_last_step_and_what_is_not_ok() -> None:
     feed = Feed()
-    assert watch_car.report(feed) == "nothing heard yet"
+    assert watch_car.report(feed) == "waiting for /power_manager/state (0 s)"
     for _ in range(EVERY):
         feed.state(0, values(mode=1.0, speed_mps=2.0))
     feed.status("/a: control", 0, "normal")
@@ -74,10 +97,17 @@ def test_the_terminal_gets_the_last_step_and_what_is_not_ok() -> None:
     assert second.split(maxsplit=1) == ["error", "/a: inputs: battery_state is missing"]
 
 
+def test_a_node_that_has_fallen_silent_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    feed = Feed()
+    for _ in range(EVERY):
+        feed.state(0, values())
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + 7.0)
+    assert watch_car.report(feed).startswith("nothing new on /power_manager/state for 7 s | mode: waiting")
+
+
 def test_every_line_of_the_charts_is_a_signal_of_the_state() -> None:
-    lines = charts(SIGNAL_NAMES)
-    assert {signal for found in lines.values() for signal in found.values()} <= set(SIGNAL_NAMES)
-    assert len(lines["slip"]) >= 2
+    assert {line.signal for chart in CHARTS for line in chart.lines} <= set(SIGNAL_NAMES)
 
 
 def test_a_port_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,20 +139,25 @@ def test_the_page_shows_a_running_car(tmp_path: Path) -> None:
         [*command, "--node", f"{name}/power_manager", "--ros-args", "-r", f"/diagnostics:={name}/diagnostics"],
         env=environment,
         stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
     )
     try:
-        assert page.stdout is not None
+        assert page.stdout is not None and page.stderr is not None
         url = re.search(r"http://localhost:\d+/", page.stdout.readline())
         assert url is not None
         found = _read_page(url[0], tmp_path)
         assert found["speed"] == pytest.approx(12.5)
         assert "mode: normal" in found["words"]
-        assert found["status"] == ["warn", f"{name}/power_manager: control", "a word"]
-        assert found["figures"] == len(charts(SIGNAL_NAMES))
+        assert found["words"].startswith(f"<b>{name}/power_manager · a van</b>")
+        assert f"<td>warn<td>{name}/power_manager: control<td>a word" in found["statuses"]
+        assert found["title"] == f"{name}/power_manager · a van"
+        assert "friction brakes: another system has them" in found["titles"]
+        assert len(found["titles"]) == len(CHARTS)
         assert found["foreign"] == []
         page.send_signal(2)
         assert page.wait(30) == 0
+        assert page.stderr.read() == ""  # also of the tab that was closed
     finally:
         for process in (page, car):
             process.kill()
@@ -132,7 +167,7 @@ def test_the_page_shows_a_running_car(tmp_path: Path) -> None:
 _CAR = """
 import sys, time, rclpy
 from rclpy.node import Node
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from sensor_msgs.msg import JointState
 from iwm_power_manager.control.record import SIGNAL_NAMES
 from iwm_power_manager.ros import messages
@@ -141,7 +176,9 @@ node = Node("power_manager", namespace=sys.argv[1])
 state = node.create_publisher(JointState, "~/state", 10)
 diagnostics = node.create_publisher(DiagnosticArray, sys.argv[1] + "/diagnostics", 10)
 values = dict.fromkeys(SIGNAL_NAMES, 0.0) | {"speed_mps": 12.5, "mode": 1.0}
+car = [KeyValue(key="vehicle", value="a van"), KeyValue(key="friction brakes", value="another system")]
 status = DiagnosticStatus(level=b"\\x01", name=node.get_fully_qualified_name() + ": control", message="a word")
+status.values = car
 other = DiagnosticStatus(level=b"\\x02", name="/another_car/power_manager: control", message="not of this car")
 for i in range(10**9):
     state.publish(messages.named_numbers_message(i * 10**7, list(values), list(values.values())))
@@ -154,11 +191,11 @@ _ASK = """(() => {
   const document_ = window.Bokeh && Bokeh.documents[0]; if (!document_) return null;
   const state = document_.get_model_by_name("state"), words = document_.get_model_by_name("words");
   const table = document_.get_model_by_name("diagnostics");
-  if (!state || !state.data.speed_mps.length || !table.data.name.length) return null;
+  if (!state || !state.data.speed_mps.length || !table.text.includes("a word")) return null;
   const all = [...document_._all_models.values()];
   return JSON.stringify({speed: state.data.speed_mps[state.data.speed_mps.length - 1], words: words.text,
-    status: [table.data.level[0], table.data.name[0], table.data.message[0]],
-    figures: all.filter(model => model.type === "Figure").length,
+    statuses: table.text, title: document.title,
+    titles: all.filter(model => model.type === "Figure").map(model => model.title.text),
     foreign: performance.getEntriesByType("resource").map(r => r.name).filter(n => !n.startsWith(location.origin)
       && !n.startsWith("data:") && !n.startsWith("blob:"))});
 })()"""
