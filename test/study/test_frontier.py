@@ -51,8 +51,24 @@ def test_a_verdict_needs_nearly_all_cells_close_none_far_below_and_the_mean_abov
     assert not any(verdict.reached for verdict in unseen.judge([*good, far]))
     assert not any(verdict.reached for verdict in unseen.judge([*good, near, near]))
     text = unseen.report([*good, far])
-    assert "NOT reached" in text and text.index("far") > text.index("worst cells")
+    assert "NOT reached" in text and text.rindex("far") > text.index("worst cells")
     assert {row["counted"] for row in unseen.to_json([far])["verdicts"]} == set(COUNTS)
+
+
+def test_what_ours_saves_is_said_by_kind_of_cell():
+    labels = ("mine, cycle 1, friction 0.9", "mine, cycle 2, friction 0.9", "mine, cycle 1, friction 0.9, logged with")
+    found = [
+        Frontier(label, MADE, (point(0.3, 5.0),), (point(saving, 5.0),), ())
+        for label, saving in zip((*labels, "car 7, cycle 1, friction 0.5"), (0.1, 0.5, 0.2, -0.4), strict=True)
+    ]
+    rows = {row.name: row for row in unseen.kinds(found)}
+    assert list(rows) == ["drawn cars", "mine, friction 0.9", "mine, logged", "all"]
+    row = rows["mine, friction 0.9"]
+    assert (row.cells, row.mean, row.worst) == (2, pytest.approx(0.3), 0.1)
+    assert (row.margin, row.worst_margin) == (pytest.approx(0.0), pytest.approx(-0.2))
+    assert row.worst < row.low < row.high < 0.5
+    assert (rows["all"].cells, rows["all"].worst, rows["drawn cars"].worst_margin) == (4, -0.4, pytest.approx(-0.7))
+    assert unseen.to_json(found)["kinds"][-1]["name"] == "all"
 
 
 def test_cells_are_drawn_from_seeds_with_and_without_noise():
