@@ -40,3 +40,27 @@ def test_a_car_on_cyclonedds_drives_and_stops(tmp_path: Path, compiled_law: None
     finally:
         running.process.kill()
         running.process.wait()
+
+
+def test_a_car_in_rclpy_drives_and_stops(tmp_path: Path, compiled_law: None) -> None:
+    name = f"/desk_{os.getpid()}"
+    absolute = ("/odom", "/joint_states", "/pedals/accelerator", "/pedals/brake")
+    absolute += ("/battery/charge", "/battery/temperature", "/diagnostics")
+    remaps = {"__ns": name} | {topic: name + topic for topic in absolute}
+    given = {"strategy": "equal", "policy_file": "", "signals_file": "config/signals/odometry_and_pedals.yaml"}
+    running = Running("iwm_power_manager.nodes.power_manager", arguments(given, remaps), DOMAIN, tmp_path)
+    try:
+        car = subprocess.run(
+            [sys.executable, EXAMPLES / "rclpy_car" / "car.py", "--seconds", "100", *arguments({}, remaps)],
+            env=environment(DOMAIN, tmp_path),
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert (car.returncode, car.stdout) == (0, "stopped\n"), car.stdout + car.stderr + running.text()
+        assert running.stop() == 0
+        assert "first torque" in running.text()
+    finally:
+        running.process.kill()
+        running.process.wait()
