@@ -204,7 +204,7 @@ def statuses_html(feed: Feed) -> str:
         f'<tr style="background:{_LEVEL_COLORS[level]}"><td>{level}<td>{html.escape(name)}<td>{html.escape(message)}'
         for name, (level, message) in sorted(feed.statuses.items())
     )
-    return f'<table style="text-align:left; overflow-wrap:anywhere"><tr><th>level<th>name<th>message{rows}</table>'
+    return f'<table style="text-align:left; overflow-wrap:break-word"><tr><th>level<th>name<th>message{rows}</table>'
 
 
 def _figure(chart: Chart, state: Any, x_range: Any) -> Any:
