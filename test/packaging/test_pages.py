@@ -132,4 +132,4 @@ def test_the_site_builds_without_a_warning(parts: list[str], tmp_path: Path) -> 
     assert built.returncode == 0, built.stderr
     assert (tmp_path / "html" / "docs" / "site" / "index.html").is_file()
     said = (tmp_path / "source" / "docs" / "site" / "commands.md").read_text()
-    assert all(f"## {name}\n" in said for name in COMMANDS)
+    assert all(f"## {name}\n\n```text\nusage: {name} " in said for name in COMMANDS)
