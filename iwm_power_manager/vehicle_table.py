@@ -2,7 +2,7 @@
 """Every number of a vehicle file: unit, range, meaning, who reads it, and what holds where the file does not give it.
 
 The one table that `vehicle` checks files by and `docs/vehicle.md` prints. A tyre's own numbers stand with its model
-(`model.tyre`), which checks them; what they mean to a reader stands here.
+(`model.tyre`).
 """
 
 from __future__ import annotations
@@ -159,16 +159,6 @@ TABLE: dict[str, dict[str, Quantity]] = {
     },
 }
 
-#: Of each model's own numbers, which have no unit. Ranges stand with the model.
-TYRE_MEANINGS = {
-    "stiffness_factor": "Magic Formula's B: slope at no slip over friction is B C D (eq. 9)",
-    "shape_factor": "its C: how far friction falls beyond the peak; 1: not at all",
-    "peak_factor": "its D: largest friction coefficient over that of the road",
-    "curvature_factor": "its E: where the peak lies; lower: at less slip and sharper",
-    "slip_stiffness": "friction coefficient per slip at no slip, on any road",
-    "sliding_factor": "friction of the sliding tyre over its peak",
-}
-
 #: Pairs that must be ordered (a fade between two equal points would divide by zero), and whether they may be equal.
 ORDERED: dict[str, tuple[tuple[str, str, bool], ...]] = {
     "motor": (
@@ -198,7 +188,7 @@ def markdown() -> str:
             lines.append(f"| `{where}` | {q.unit} | {low} to {q.high:g} | {q.meaning} | {q.default} | {policy} |")
         if section == "tyre":
             lines += [
-                f"| `tyre.{key}` |  | {low:g} to {high:g} | `model: {name}`: {TYRE_MEANINGS[key]} |  | yes |"
+                f"| `tyre.{key}` |  | {low:g} to {high:g} | `model: {name}`: {model.meanings[key]} |  | yes |"
                 for name, model in MODELS.items()
                 for key, (low, high) in model.ranges.items()
             ]

@@ -38,13 +38,17 @@ DEFAULT = "magic_formula"
 
 
 class TyreModel(NamedTuple):
-    """A model: its number, and its keys in a vehicle file with their ranges, in the order of the coefficients."""
+    """A model: its number, and its keys in a vehicle file with range and meaning, in the order of the coefficients."""
 
     code: int
     ranges: dict[str, tuple[float, float]]
+    meanings: dict[str, str]
 
 
-MODELS = {"magic_formula": TyreModel(_MAGIC_FORMULA, magic_formula.RANGES), "fiala": TyreModel(_FIALA, fiala.RANGES)}
+MODELS = {
+    "magic_formula": TyreModel(_MAGIC_FORMULA, magic_formula.RANGES, magic_formula.MEANINGS),
+    "fiala": TyreModel(_FIALA, fiala.RANGES, fiala.MEANINGS),
+}
 
 
 def make(name: str, values: Mapping[str, float], slip_speed_floor_mps: float) -> Tyre:

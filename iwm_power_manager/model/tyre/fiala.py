@@ -21,6 +21,10 @@ from iwm_power_manager.model.parameters import TyreCoefficients
 
 #: Keys of a vehicle file with their ranges, in the order of the coefficients: C, k.
 RANGES = {"slip_stiffness": (1.0, 200.0), "sliding_factor": (0.3, 1.0)}
+MEANINGS = {
+    "slip_stiffness": "friction coefficient per slip at no slip, on any road",
+    "sliding_factor": "friction of the sliding tyre over its peak",
+}
 
 
 @kernel

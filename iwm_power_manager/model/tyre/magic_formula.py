@@ -15,6 +15,12 @@ RANGES = {
     "peak_factor": (0.1, 2.0),
     "curvature_factor": (-10.0, 1.0),
 }
+MEANINGS = {
+    "stiffness_factor": "Magic Formula's B: slope at no slip over friction is B C D (eq. 9)",
+    "shape_factor": "its C: how far friction falls beyond the peak; 1: not at all",
+    "peak_factor": "its D: largest friction coefficient over that of the road",
+    "curvature_factor": "its E: where the peak lies; lower: at less slip and sharper",
+}
 
 
 @kernel
