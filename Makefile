@@ -44,7 +44,7 @@ bench: setup-dev  ## Time control path, bags, solver and closed loop on this mac
 
 bench-peers: setup-dev  ## FASTSim in an environment of its own, runs/peers: a peer of benchmarks/performance.py (1 min)
 	@test -x runs/peers/bin/python || $(BIN)/python -m venv runs/peers
-	@runs/peers/bin/python -m pip install --quiet --require-hashes -r benchmarks/requirements.txt
+	@runs/peers/bin/python -m pip install --quiet --require-hashes -r benchmarks/requirements.txt -c benchmarks/requirements.txt
 
 ##@ Documentation
 .PHONY: docs
