@@ -85,6 +85,7 @@ def played_to_the_node(
         f"policy_file:={policy_file}",
         "use_sim_time:=true",
         "switching_power_w:=0.0",
+        "friction_source:=parameter",  # a replay from inputs alone is told the friction
     ]
     manager = start("nodes.power_manager", "--ros-args", *(text for name in parameters for text in ("-p", name)))
     recorder = start(

@@ -72,6 +72,7 @@ class StandIn:
         self.motors = self.node.create_publisher(m.JointState, m.WHEEL_TORQUE_COMMAND, profile)
         self.brakes = self.node.create_publisher(m.JointState, m.FRICTION_BRAKE_COMMAND, profile)
         self.received: dict[str, list[Any]] = {}
+        self.unanswered: list[float] = []
         everything = qos.profile(lockstep=True)
         for topic, kind in m.TOPIC_TYPES.items():
             name = f"{self.namespace}/clock" if topic == m.CLOCK else topic
@@ -88,8 +89,11 @@ class StandIn:
         def keep(message: Any) -> None:
             self.received[topic].append(message)
             if topic == m.POWER_DEMAND:
+                self.unanswered.append(message.data)
+            # Topics are not ordered among each other: the first demand may come before the first speed.
+            while self.unanswered and self.received[m.VEHICLE_SPEED]:
                 speed = m.read_vehicle_speed(self.received[m.VEHICLE_SPEED][-1])
-                self.answer(speed.stamp_ns, speed.speed_mps, message.data)
+                self.answer(speed.stamp_ns, speed.speed_mps, self.unanswered.pop(0))
 
         return keep
 
