@@ -21,15 +21,12 @@ from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.task import Future
 from sensor_msgs.msg import JointState
 
 from iwm_power_manager.ros import ending, messages, qos
+from iwm_power_manager.ros.asking import AGAIN_S, Question
 
 PATIENCE_S = 60.0
-
-#: A service may answer before it has found who asked: the middleware drops that answer. Then it is asked again.
-AGAIN_S = 5.0
 TRANSITIONS = {
     "configure": Transition.TRANSITION_CONFIGURE,
     "activate": Transition.TRANSITION_ACTIVATE,
@@ -60,21 +57,6 @@ def environment(domain: int, log_dir: Path) -> dict[str, str]:
         "ROS_LOG_DIR": str(log_dir),
         "PYTHONUNBUFFERED": "1",
     }
-
-
-def answering(client: Client, request: Any) -> Callable[[], Future | None]:
-    """Condition to spin for: the future of an answered request, which is made again each `AGAIN_S`."""
-    asked: list[Future] = []
-    due_s = 0.0
-
-    def answered() -> Future | None:
-        nonlocal due_s
-        if time.monotonic() >= due_s:
-            due_s = time.monotonic() + AGAIN_S
-            asked.append(client.call_async(request))
-        return next((future for future in asked if future.done()), None)
-
-    return answered
 
 
 def arguments(parameters: Mapping[str, Any], remaps: Mapping[str, str] | None = None) -> list[str]:
@@ -210,7 +192,7 @@ class Bench:
     def call(self, kind: Any, service: str, request: Any) -> Any:
         """Call a service of the power manager that may be called twice."""
         client = self._client(kind, service)
-        return self.spin_until(answering(client, request), f"an answer of {service}").result()
+        return self.spin_until(Question(client, request).answer, f"an answer of {service}")
 
     def change_state(self, transition: str) -> bool:
         """Ask for a lifecycle transition, once, since a second one would be refused; its answer may be lost."""

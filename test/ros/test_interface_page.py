@@ -12,10 +12,12 @@ from types import ModuleType
 from xml.etree import ElementTree
 
 import pytest
-from bench import Running, answering, arguments
+from bench import Running, arguments
 from rcl_interfaces.srv import ListParameters
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, ReliabilityPolicy
+
+from iwm_power_manager.ros.asking import Question
 
 ROOT = Path(__file__).resolve().parents[2]
 INTERFACE = json.loads((ROOT / "docs" / "interface.json").read_text())
@@ -142,6 +144,6 @@ def test_a_running_node_has_the_parameters_of_the_interface(all_three, name: str
     request = ListParameters.Request()
     client = bench.node.create_client(ListParameters, f"{name}/list_parameters")
     bench.spin_until(client.service_is_ready, "the service")
-    future = bench.spin_until(answering(client, request), "the answer")
-    found = {parameter for parameter in future.result().result.names if not parameter.startswith(own)}
+    answer = bench.spin_until(Question(client, request).answer, "the answer")
+    found = {parameter for parameter in answer.result.names if not parameter.startswith(own)}
     assert found == {parameter["name"] for parameter in INTERFACE["parameters"][name]}

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import rclpy
-from bench import Bench, Running, answering, arguments
+from bench import Bench, Running, arguments
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -21,6 +21,7 @@ from rclpy.executors import SingleThreadedExecutor
 
 from iwm_power_manager.nodes import preparation
 from iwm_power_manager.ros import messages, qos
+from iwm_power_manager.ros.asking import Question
 from iwm_power_manager.share import resolve
 
 MODULE = "iwm_power_manager.nodes.power_manager"
@@ -198,10 +199,10 @@ def test_services_are_answered_while_it_prepares(node: Any, monkeypatch: pytest.
     configured = change.call_async(request)
     spin_until(begun.is_set)
     for client, asked in ((state, GetState.Request()), (read, GetParameters.Request(names=["friction"]))):
-        spin_until(answering(client, asked))
+        spin_until(Question(client, asked).answer)
     assert not configured.done()
-    answer = spin_until(answering(state, GetState.Request()))
-    assert answer.result().current_state.id == State.PRIMARY_STATE_UNCONFIGURED
+    answer = spin_until(Question(state, GetState.Request()).answer)
+    assert answer.current_state.id == State.PRIMARY_STATE_UNCONFIGURED
     release.set()
     spin_until(configured.done)
     assert configured.result().success

@@ -62,6 +62,14 @@ def test_a_vehicle_with_a_bad_value_is_named_with_its_key(tmp_path) -> None:
     assert f"{car}: chassis.mass_kg" in fails_with(tmp_path, arguments({"strategy": "equal", "vehicle_file": car}))
 
 
+def test_pedals_on_two_topics_close_no_set_of_lockstep(tmp_path) -> None:
+    given = {"strategy": "equal", "lockstep": True, "signals_file": "config/signals/odometry_and_pedals.yaml"}
+    line = fails_with(tmp_path, arguments(given))
+    assert (
+        "signals: the demand closes a set of inputs in lock-step, and comes on two topics; allowed: one topic" in line
+    )
+
+
 def test_a_parameter_file_that_is_missing_or_no_yaml_gives_one_line(tmp_path) -> None:
     line = fails_with(tmp_path, ["--ros-args", "--params-file", "/nowhere/params.yaml"])
     assert line == "power_manager: /nowhere/params.yaml: cannot be read: No such file or directory"
