@@ -34,7 +34,7 @@ unseen: setup-run  ## Our strategy on cycles and cars that were not there when i
 	@$(BIN)/evaluate --unseen runs/unseen $(ARGS)
 
 roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required (2 min)
-	@$(BIN)/python -m iwm_sim.tools.roads --unknown --page docs/roads.md $(ARGS)
+	@$(BIN)/python -m campaigns.roads --unknown --page docs/roads.md $(ARGS)
 
 docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (2 min)
 	@$(BIN)/python scripts/docs_numbers $(ARGS)

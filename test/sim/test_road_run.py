@@ -9,13 +9,14 @@ import math
 import numpy as np
 import pytest
 
+from campaigns.road_page import page
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import road_run
 from iwm_sim.drive import Drive
 from iwm_sim.faults import Fault
-from iwm_sim.road_report import page, text
+from iwm_sim.road_report import text
 from iwm_sim.scenario import Bound, Demand, Friction, Scenario
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"))

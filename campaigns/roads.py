@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drive the scenarios of real roads and say what came out: `roads --help`.
+"""Drive the scenarios of real roads and say what came out: `make roads`, `python -m campaigns.roads --help`.
 
 Exit codes: 0 every requirement is met; 1 one is not; 2 bad arguments or files; 130 interrupted.
 """
@@ -12,6 +12,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from campaigns.road_page import page, unknown
+from campaigns.unknown_friction import all_cells, all_jumped, differs, savings
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
@@ -19,10 +21,9 @@ from iwm_power_manager.exit_codes import DONE, FAILED
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.command import ended, write_json
-from iwm_sim.road_report import page, text, unknown
+from iwm_sim.road_report import text
 from iwm_sim.road_run import RoadResult, check_scenario
 from iwm_sim.scenario import DEFAULT_VEHICLE, FOLDER, load_scenario
-from iwm_sim.unknown_friction import all_cells, all_jumped, differs, savings
 
 
 def parser() -> argparse.ArgumentParser:

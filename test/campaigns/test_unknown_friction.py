@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import pytest
 
-from iwm_sim import unknown_friction as unknown
-from iwm_sim.road_report import unknown as page
+from campaigns import unknown_friction as unknown
+from campaigns.road_page import unknown as page
 from iwm_sim.scenario import DEFAULT_VEHICLE, Demand
 
 BRAKES, BRAKES_GENTLY, DRIVES = unknown.DEMANDS[:3]

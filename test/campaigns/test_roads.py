@@ -7,7 +7,7 @@ import json
 
 import yaml
 
-from iwm_sim.tools.roads import main
+from campaigns.roads import main
 
 SHORT = {
     "format": 1,
