@@ -12,7 +12,7 @@ import argparse
 import time
 
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.model.longitudinal import step
+from iwm_power_manager.model.longitudinal import Speeds, Torques, step
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.plant import Surroundings, advance, initial_plant
@@ -22,19 +22,15 @@ ROUNDS = 7
 
 
 @kernel
-def bare(count, speed, wheels, vehicle):
+def bare(count, speeds, vehicle):
     """Car and wheels only, on the torques of `driven`."""
     acceleration = 0.0
     for k in range(count):
         torque = 30.0 if k % 200 < 100 else -30.0
-        motors = (torque, torque, torque, torque)
-        motion = step(
-            speed, wheels, acceleration, motors, (0.0, 0.0, 0.0, 0.0), 0.0, (0.9, 0.9, 0.9, 0.9), 0.01, vehicle
-        )
-        acceleration = (motion.speed_mps - speed) / 0.01
-        speed = motion.speed_mps
-        wheels = motion.wheel_speed_radps
-    return speed
+        moved = step(speeds, Torques(torque, torque, 0.0, 0.0), acceleration, 0.0, (0.9, 0.9), 0.01, vehicle)
+        acceleration = (moved.speeds.car_mps - speeds.car_mps) / 0.01
+        speeds = moved.speeds
+    return speeds.car_mps
 
 
 @kernel
@@ -56,7 +52,7 @@ def main() -> int:
     car = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), "none").params
     state = initial_plant(car, 0.8, 15.0)
     cases = {
-        "car and wheels alone": lambda n: bare(n, state.speed_mps, state.wheel_speed_radps, car),
+        "car and wheels alone": lambda n: bare(n, Speeds(state.speed_mps, *state.wheel_speed_radps[::2]), car),
         "plant, straight line": lambda n: driven(n, state, 0.0, car),
         "plant, in the plane": lambda n: driven(n, state, 0.001, car),
     }

@@ -30,9 +30,10 @@ import numpy as np
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n, rolling_force_n
-from iwm_power_manager.model.longitudinal import Four
 from iwm_power_manager.model.parameters import Tyre, VehicleParams, Wheel
 from iwm_power_manager.model.tyre import friction_and_slope, peak_ratio
+
+Four = tuple[float, float, float, float]  # front_left, front_right, rear_left, rear_right
 
 #: Below this speed of car and rims, m/s, a car that can be held is at rest.
 REST_MPS = 0.02

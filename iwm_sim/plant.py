@@ -25,7 +25,7 @@ from iwm_power_manager.grid import interpolate1, locate
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.battery import current_a
 from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n
-from iwm_power_manager.model.longitudinal import Four
+from iwm_power_manager.model.longitudinal import Speeds, Torques
 from iwm_power_manager.model.motor import (
     electrical_power_w,
     heat_after,
@@ -34,8 +34,9 @@ from iwm_power_manager.model.motor import (
     torque_limit_nm,
 )
 from iwm_power_manager.model.parameters import Axle, Battery, Motor, VehicleParams
-from iwm_power_manager.model.two_axles import Speeds, Torques, step_onward
+from iwm_power_manager.model.two_axles import step_onward
 from iwm_sim import double_track
+from iwm_sim.double_track import Four
 
 
 class Energies(NamedTuple):

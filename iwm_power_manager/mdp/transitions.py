@@ -13,8 +13,9 @@ from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.mdp.threads import over_ranges
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.decision import axles_gated, step_near, wheel_speed_of_state
+from iwm_power_manager.model.longitudinal import Speeds
 from iwm_power_manager.model.parameters import VehicleParams
-from iwm_power_manager.model.two_axles import Speeds, curve_of
+from iwm_power_manager.model.two_axles import curve_of
 
 #: Newton's method does not start from a car at rest, m/s.
 _SLOW_MPS = 0.05

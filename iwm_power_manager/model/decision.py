@@ -15,11 +15,12 @@ from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.chassis import GRAVITY_MPS2, equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.gate import axle_gated, gated_split
 from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
+from iwm_power_manager.model.longitudinal import Moved, Speeds, Torques
 from iwm_power_manager.model.motor import idle_drag_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.model.quasi_steady import USABLE_FRICTION, Axles, axles_of, demand_force_n, split_outcome_w
 from iwm_power_manager.model.torque import blend, conversion_speed_radps
-from iwm_power_manager.model.two_axles import UNSURE, Curve, Moved, Speeds, Torques, step_from
+from iwm_power_manager.model.two_axles import UNSURE, Curve, step_from
 from iwm_power_manager.model.tyre import peak_ratio, slip_ratio
 
 #: Where the delivered power is measured: torque times speed at the wheel (sees no power lost in slip), or at the

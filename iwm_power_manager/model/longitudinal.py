@@ -9,8 +9,9 @@ The step keeps the books exactly: forces are constant over the step, so a force 
 after it is the energy that flowed, and kinetic energies, works and losses add up to rounding error whatever the step
 size (see `iwm_sim.plant`).
 
-The car only rolls forwards: brakes, bearing drag and rolling resistance are Coulomb friction, which stops a motion and
-holds, but never reverses it; a car that would roll backwards stands still.
+Left and right are alike here, so that a wheel of each axle is solved; `iwm_sim.double_track` has four wheels of their
+own. The car only rolls forwards: brakes, bearing drag and rolling resistance are Coulomb friction, which stops a motion
+and holds, but never reverses it; a car that would roll backwards stands still.
 """
 
 from __future__ import annotations
@@ -23,25 +24,41 @@ from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, 
 from iwm_power_manager.model.parameters import Axle, Tyre, VehicleParams, Wheel
 from iwm_power_manager.model.tyre import friction_and_slope, friction_coefficient, peak_ratio, slip_ratio
 
-Two = tuple[float, float]  # left, right
-Four = tuple[float, float, float, float]  # front_left, front_right, rear_left, rear_right
+Two = tuple[float, float]  # front, rear
 
 
-class Motion(NamedTuple):
-    """Car and wheels at the end of a step, and the forces that acted during it.
+class Speeds(NamedTuple):
+    """Speeds of car (m/s) and wheels (rad/s)."""
+
+    car_mps: float
+    front_radps: float
+    rear_radps: float
+
+
+class Torques(NamedTuple):
+    """What acts on a wheel of each axle through a step, N m: motor, and what brake and drag exert at most (>= 0)."""
+
+    front_motor_nm: float
+    rear_motor_nm: float
+    front_resisting_nm: float
+    rear_resisting_nm: float
+
+
+class Moved(NamedTuple):
+    """A step: speeds at its end, and what acted during it.
 
     Attributes
     ----------
-    speed_mps, wheel_speed_radps : at the end of the step
-    tyre_force_n : of each wheel, driving positive
-    resisting_torque_nm : what brake and idle drag really exerted, at most what they were told, >= 0
+    front_force_n, rear_force_n : of a tyre, driving positive
+    front_resisting_nm, rear_resisting_nm : what brake and idle drag really exerted, at most what they were told, >= 0
     rolling_force_n : what rolling resistance really exerted (less than eq. 4 only while it holds the car)
     """
 
-    speed_mps: float
-    wheel_speed_radps: Four
-    tyre_force_n: Four
-    resisting_torque_nm: Four
+    speeds: Speeds
+    front_force_n: float
+    rear_force_n: float
+    front_resisting_nm: float
+    rear_resisting_nm: float
     rolling_force_n: float
 
 
@@ -106,55 +123,6 @@ def wheel_step(
 
 
 @kernel
-def axle_step(
-    wheel_speed_radps: Two,
-    motor_torque_nm: Two,
-    resisting_torque_nm: Two,
-    friction: Two,
-    speed_after_mps: float,
-    normal_force_n: float,
-    dt_s: float,
-    axle: Axle,
-) -> tuple[Two, Two, Two]:
-    """`wheel_step` for the left and the right wheel of an axle; wheels that are alike are solved once.
-
-    Returns
-    -------
-    wheel speeds after the step (rad/s), tyre forces (N), torques the brakes really exerted (N m)
-    """
-    w, f, b = wheel_step(
-        wheel_speed_radps[0],
-        speed_after_mps,
-        motor_torque_nm[0],
-        resisting_torque_nm[0],
-        normal_force_n,
-        friction[0],
-        dt_s,
-        axle.wheel,
-        axle.tyre,
-    )
-    if (
-        wheel_speed_radps[0] == wheel_speed_radps[1]
-        and motor_torque_nm[0] == motor_torque_nm[1]
-        and resisting_torque_nm[0] == resisting_torque_nm[1]
-        and friction[0] == friction[1]
-    ):
-        return (w, w), (f, f), (b, b)
-    w1, f1, b1 = wheel_step(
-        wheel_speed_radps[1],
-        speed_after_mps,
-        motor_torque_nm[1],
-        resisting_torque_nm[1],
-        normal_force_n,
-        friction[1],
-        dt_s,
-        axle.wheel,
-        axle.tyre,
-    )
-    return (w, w1), (f, f1), (b, b1)
-
-
-@kernel
 def _inertia_ratio(axle: Axle, mass_kg: float) -> float:
     """Inertia of an axle's two wheels, as a mass at the rim, over the car's mass."""
     return 2.0 * axle.wheel.inertia_kgm2 / (axle.wheel.radius_m * axle.wheel.radius_m * mass_kg)
@@ -162,65 +130,44 @@ def _inertia_ratio(axle: Axle, mass_kg: float) -> float:
 
 @kernel
 def step(
-    speed_mps: float,
-    wheel_speed_radps: Four,
+    before: Speeds,
+    torques: Torques,
     acceleration_mps2: float,
-    motor_torque_nm: Four,
-    resisting_torque_nm: Four,
     grade: float,
-    friction: Four,
+    friction: Two,
     dt_s: float,
     vehicle: VehicleParams,
-) -> Motion:
+) -> Moved:
     """Advance car and wheels by one implicit step.
 
     Parameters
     ----------
-    speed_mps, wheel_speed_radps : before the step, >= 0
+    before : >= 0
     acceleration_mps2 : of the previous step; only a first guess
-    motor_torque_nm : at each wheel
-    resisting_torque_nm : friction brake plus idle drag at each wheel, >= 0
     grade : rise over run
-    friction : peak friction coefficient under each wheel
+    friction : peak friction coefficient under the front and the rear wheels
     dt_s : step, > 0
     """
-    chassis = vehicle.chassis
+    chassis, front, rear = vehicle.chassis, vehicle.front, vehicle.rear
     mass = chassis.mass_kg
     # A change of the car's speed drags the wheels' inertia along: the known slope makes the iteration a Newton step.
-    coupling = 1.0 + (_inertia_ratio(vehicle.front, mass) + _inertia_ratio(vehicle.rear, mass))
+    coupling = 1.0 + (_inertia_ratio(front, mass) + _inertia_ratio(rear, mass))
     grade_force = grade_force_n(grade, chassis)
     rolling_drop = rolling_force_n(grade, chassis) * dt_s / mass
-    after = max(speed_mps + acceleration_mps2 * dt_s, 0.0)
+    after = max(before.car_mps + acceleration_mps2 * dt_s, 0.0)
     # The faster the car is assumed to be, the more the tyres slow it: the root lies between what was too slow and what
     # was too fast. Without the bracket the iteration would swing about a car that locked wheels bring to rest.
     low, high, last_change = 0.0, math.inf, math.inf
-    front = rear = ((0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
+    f = r = (0.0, 0.0, 0.0)
     moved = coasting = after
     for _ in range(60):
-        front_n, rear_n = normal_forces_n((after - speed_mps) / dt_s, after, grade, chassis)
-        front = axle_step(
-            wheel_speed_radps[:2],
-            motor_torque_nm[:2],
-            resisting_torque_nm[:2],
-            friction[:2],
-            after,
-            front_n,
-            dt_s,
-            vehicle.front,
-        )
-        rear = axle_step(
-            wheel_speed_radps[2:],
-            motor_torque_nm[2:],
-            resisting_torque_nm[2:],
-            friction[2:],
-            after,
-            rear_n,
-            dt_s,
-            vehicle.rear,
-        )
-        drag = aerodynamic_force_n(after, chassis)
-        tyres = front[1][0] + front[1][1] + rear[1][0] + rear[1][1]
-        coasting = speed_mps + dt_s / mass * (tyres - drag - grade_force)
+        front_n, rear_n = normal_forces_n((after - before.car_mps) / dt_s, after, grade, chassis)
+        motor, resisting = torques.front_motor_nm, torques.front_resisting_nm
+        f = wheel_step(before.front_radps, after, motor, resisting, front_n, friction[0], dt_s, front.wheel, front.tyre)
+        motor, resisting = torques.rear_motor_nm, torques.rear_resisting_nm
+        r = wheel_step(before.rear_radps, after, motor, resisting, rear_n, friction[1], dt_s, rear.wheel, rear.tyre)
+        tyres = f[1] + f[1] + r[1] + r[1]
+        coasting = before.car_mps + dt_s / mass * (tyres - aerodynamic_force_n(after, chassis) - grade_force)
         moved = max(coasting - rolling_drop, 0.0)
         change = moved - after
         if abs(change) <= 1e-10 * (1.0 + moved):
@@ -233,10 +180,4 @@ def step(
         if high < math.inf and (not low < after < high or abs(change) > 0.5 * last_change):
             after = 0.5 * (low + high)
         last_change = abs(change)
-    return Motion(
-        speed_mps=moved,
-        wheel_speed_radps=front[0] + rear[0],
-        tyre_force_n=front[1] + rear[1],
-        resisting_torque_nm=front[2] + rear[2],
-        rolling_force_n=(coasting - moved) * mass / dt_s,
-    )
+    return Moved(Speeds(moved, f[0], r[0]), f[1], r[1], f[2], r[2], (coasting - moved) * mass / dt_s)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The step of `model.longitudinal` for a car whose left and right wheels are alike, from a good guess.
+"""The step of `model.longitudinal` from a good guess.
 
 Three unknowns are left: the speeds of the car and of a wheel of each axle at the end of the step. Newton's method on
 all three at once takes two or three iterations from the solution of a neighbouring problem, or from the car's motion
@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n, rolling_force_n
-from iwm_power_manager.model.longitudinal import Two, step
+from iwm_power_manager.model.longitudinal import Moved, Speeds, Torques, Two, step
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.model.tyre import friction_and_slope
 
@@ -24,34 +24,6 @@ _SMALL = 1e-8
 _MOST_ITERATIONS = 8
 #: Slips at which a tyre's curve is sampled.
 _SAMPLES = 200
-
-
-class Speeds(NamedTuple):
-    """Speeds of car (m/s) and wheels (rad/s)."""
-
-    car_mps: float
-    front_radps: float
-    rear_radps: float
-
-
-class Torques(NamedTuple):
-    """What acts on a wheel of each axle through a step, N m: motor, and what brake and drag exert at most (>= 0)."""
-
-    front_motor_nm: float
-    rear_motor_nm: float
-    front_resisting_nm: float
-    rear_resisting_nm: float
-
-
-class Moved(NamedTuple):
-    """A step: speeds at its end, the force of a tyre of each axle (N), what brake and drag, and rolling, exerted."""
-
-    speeds: Speeds
-    front_force_n: float
-    rear_force_n: float
-    front_resisting_nm: float
-    rear_resisting_nm: float
-    rolling_force_n: float
 
 
 class Curve(NamedTuple):
@@ -220,50 +192,24 @@ def _newton(
 
 
 @kernel
-def _moved(
-    sure: bool,
-    before: Speeds,
-    torques: Torques,
-    after: Speeds,
-    guess: Speeds,
-    grade: float,
-    friction: Two,
-    dt_s: float,
-    vehicle: VehicleParams,
-) -> Moved:
-    """The step to speeds that are sure, or as `longitudinal.step` finds it from a guess."""
-    t = torques
-    if sure:
-        front, rear = vehicle.front.wheel, vehicle.rear.wheel
-        front_gained = front.inertia_kgm2 / dt_s * (after.front_radps - before.front_radps)
-        rear_gained = rear.inertia_kgm2 / dt_s * (after.rear_radps - before.rear_radps)
-        return Moved(
-            after,
-            (t.front_motor_nm - t.front_resisting_nm - front_gained) / front.radius_m,
-            (t.rear_motor_nm - t.rear_resisting_nm - rear_gained) / rear.radius_m,
-            t.front_resisting_nm,
-            t.rear_resisting_nm,
-            rolling_force_n(grade, vehicle.chassis),
-        )
-    motion = step(
-        before.car_mps,
-        (before.front_radps, before.front_radps, before.rear_radps, before.rear_radps),
-        (guess.car_mps - before.car_mps) / dt_s,
-        (t.front_motor_nm, t.front_motor_nm, t.rear_motor_nm, t.rear_motor_nm),
-        (t.front_resisting_nm, t.front_resisting_nm, t.rear_resisting_nm, t.rear_resisting_nm),
-        grade,
-        (friction[0], friction[0], friction[1], friction[1]),
-        dt_s,
-        vehicle,
-    )
+def _moved(before: Speeds, torques: Torques, after: Speeds, grade: float, dt_s: float, vehicle: VehicleParams) -> Moved:
+    """The step to known speeds."""
+    t, front, rear = torques, vehicle.front.wheel, vehicle.rear.wheel
+    front_gained = front.inertia_kgm2 / dt_s * (after.front_radps - before.front_radps)
+    rear_gained = rear.inertia_kgm2 / dt_s * (after.rear_radps - before.rear_radps)
     return Moved(
-        Speeds(motion.speed_mps, motion.wheel_speed_radps[0], motion.wheel_speed_radps[2]),
-        motion.tyre_force_n[0],
-        motion.tyre_force_n[2],
-        motion.resisting_torque_nm[0],
-        motion.resisting_torque_nm[2],
-        motion.rolling_force_n,
+        after,
+        (t.front_motor_nm - t.front_resisting_nm - front_gained) / front.radius_m,
+        (t.rear_motor_nm - t.rear_resisting_nm - rear_gained) / rear.radius_m,
+        t.front_resisting_nm,
+        t.rear_resisting_nm,
+        rolling_force_n(grade, vehicle.chassis),
     )
+
+
+@kernel
+def _turning(speeds: Speeds) -> bool:
+    return speeds.car_mps > 0.0 and speeds.front_radps > 0.0 and speeds.rear_radps > 0.0
 
 
 @kernel
@@ -285,20 +231,18 @@ def step_from(
     curves : `curve_of` the front and the rear tyre, or `UNSURE`
     """
     both = (friction, friction)
-    sure = curves[0].fall > -math.inf and guess.car_mps > 0.0 and guess.front_radps > 0.0 and guess.rear_radps > 0.0
-    after = guess
-    if sure:
+    if curves[0].fall > -math.inf and _turning(guess):
         found = _newton(before, torques, guess, 0.0, both, dt_s, vehicle)
-        after = found.speeds
         front_rate = vehicle.front.wheel.inertia_kgm2 / dt_s
         rear_rate = vehicle.rear.wheel.inertia_kgm2 / dt_s
-        car = after.car_mps
-        sure = (
+        car = found.speeds.car_mps
+        if (
             found.found
             and _only_one(car, found.front_n, found.front_force_n, curves[0], front_rate, vehicle.front)
             and _only_one(car, found.rear_n, found.rear_force_n, curves[1], rear_rate, vehicle.rear)
-        )
-    return _moved(sure, before, torques, after, guess, 0.0, both, dt_s, vehicle)
+        ):
+            return _moved(before, torques, found.speeds, 0.0, dt_s, vehicle)
+    return step(before, torques, (guess.car_mps - before.car_mps) / dt_s, 0.0, both, dt_s, vehicle)
 
 
 @kernel
@@ -328,8 +272,8 @@ def step_onward(
         before.front_radps + gained / vehicle.front.wheel.radius_m,
         before.rear_radps + gained / vehicle.rear.wheel.radius_m,
     )
-    if guess.car_mps > 0.0 and guess.front_radps > 0.0 and guess.rear_radps > 0.0:
+    if _turning(guess):
         found = _newton(before, torques, guess, grade, friction, dt_s, vehicle)
         if found.found and found.rising:
-            return _moved(True, before, torques, found.speeds, guess, grade, friction, dt_s, vehicle)
-    return _moved(False, before, torques, guess, guess, grade, friction, dt_s, vehicle)
+            return _moved(before, torques, found.speeds, grade, dt_s, vehicle)
+    return step(before, torques, (guess.car_mps - before.car_mps) / dt_s, grade, friction, dt_s, vehicle)

@@ -10,8 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from iwm_power_manager.model.chassis import aerodynamic_force_n, grade_force_n, normal_forces_n
-from iwm_power_manager.model.longitudinal import step
-from iwm_power_manager.model.two_axles import UNSURE, Speeds, Torques, curve_of, step_from, step_onward
+from iwm_power_manager.model.longitudinal import Speeds, Torques, step
+from iwm_power_manager.model.two_axles import UNSURE, curve_of, step_from, step_onward
 from iwm_power_manager.model.tyre import friction_coefficient, peak_slip, slip_ratio
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -21,19 +21,7 @@ FIALA = CAR.with_axles(tyre=CAR.front.tyre._replace(model=1, coefficients=(30.0,
 
 
 def _from_anywhere(before, torques, friction, dt_s, car):
-    t = torques
-    motion = step(
-        before.car_mps,
-        (before.front_radps, before.front_radps, before.rear_radps, before.rear_radps),
-        0.0,
-        (t.front_motor_nm, t.front_motor_nm, t.rear_motor_nm, t.rear_motor_nm),
-        (t.front_resisting_nm, t.front_resisting_nm, t.rear_resisting_nm, t.rear_resisting_nm),
-        0.0,
-        (friction, friction, friction, friction),
-        dt_s,
-        car,
-    )
-    return motion.speed_mps, motion.wheel_speed_radps[0], motion.wheel_speed_radps[2]
+    return tuple(step(before, torques, 0.0, 0.0, (friction, friction), dt_s, car).speeds)
 
 
 def _curves(friction, car):
@@ -100,10 +88,7 @@ def test_onward_the_motion_is_that_of_the_general_step_or_the_one_without_a_jump
 ):
     before = Speeds(speed, speed * (1.0 + slips[0]) / 0.33, speed * (1.0 + slips[1]) / 0.33)
     moved = step_onward(before, Torques(*motors, *brakes), 0.5, grade, friction, 0.01, car)
-    pairs = [(value, value) for value in (*before[1:], *motors, *brakes, *friction)]
-    wheels, motor, brake, mu = (pairs[i] + pairs[i + 1] for i in (0, 2, 4, 6))
-    general = step(speed, wheels, 0.5, motor, brake, grade, mu, 0.01, car)
-    wanted = (general.speed_mps, *general.wheel_speed_radps[::2])
+    wanted = tuple(step(before, Torques(*motors, *brakes), 0.5, grade, friction, 0.01, car).speeds)
     # What acts on the car is what accelerates it (eq. 1), and each tyre's force is that of its slip (eq. 6, 9).
     air, slope = aerodynamic_force_n(moved.speeds.car_mps, car.chassis), grade_force_n(grade, car.chassis)
     force = 2.0 * (moved.front_force_n + moved.rear_force_n) - air - slope - moved.rolling_force_n

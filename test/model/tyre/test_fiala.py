@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model import tyre as model
-from iwm_power_manager.model.longitudinal import step
+from iwm_power_manager.model.longitudinal import Speeds, Torques, step
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 
@@ -83,10 +83,10 @@ def test_a_vehicle_file_chooses_the_model_and_its_car_moves(tmp_path):
     paper = load_vehicle(PAPER)
     assert model.numbers(fiala.params.front.tyre)[0] == "fiala"
     assert fiala.hash != paper.hash
-    turning = (20.0 / 0.33,) * 4
+    rolling = Speeds(20.0, 20.0 / 0.33, 20.0 / 0.33)
     for car in (fiala.params, paper.params):
-        motion = step(20.0, turning, 0.0, (50.0,) * 4, (0.0,) * 4, 0.0, (0.9,) * 4, 0.01, car)
-        assert motion.speed_mps > 20.0
+        moved = step(rolling, Torques(50.0, 50.0, 0.0, 0.0), 0.0, 0.0, (0.9, 0.9), 0.01, car)
+        assert moved.speeds.car_mps > 20.0
 
 
 def test_the_same_numbers_with_the_model_s_name_are_the_same_car(tmp_path):
