@@ -21,15 +21,58 @@ MAX_TOP_SPEED_MPS = 70.0
 _GRAVITY_MPS2 = 9.81
 
 
-class _Check(NamedTuple):
+class _Bound(NamedTuple):
+    """What a number is turned into, in which unit, its bounds, and the likely mistake below and above them."""
+
     key: str
     what: str
-    unit: str
-    value: float
     low: float
     high: float
     if_low: str
     if_high: str
+
+
+_KILOWATTS = "kW in a W field?"
+_SHAFT = "a torque at the motor's shaft without gear?"
+_ONE_MOTOR = "of one motor is meant"
+_LIMIT = "of the power of all motors"
+_VOLTAGE = "of what the discharge limit allows at most (Voc^2 / 4 P)"
+_PLANT = "of resistance_ohm, together with polarisation_resistance_ohm"
+#: In the order of `_motor_values` and `_battery_values`.
+_MOTOR = (
+    _Bound("max_power_w", "W per kg of car and motor", 0.5, 1000.0, _KILOWATTS, f"the power {_ONE_MOTOR}"),
+    _Bound(
+        "peak_torque_nm",
+        "m/s at which peak torque takes all of max_power_w",
+        0.5,
+        80.0,
+        "kW in a W field, or the torque of the whole car?",
+        _SHAFT,
+    ),
+    _Bound("peak_torque_nm", "g of this axle alone", 0.01, 5.0, _SHAFT, f"the torque {_ONE_MOTOR}"),
+    _Bound(
+        "loss",
+        "efficiency at half of peak torque and full power",
+        0.2,
+        0.9995,
+        "losses of all motors, or rpm in a rad/s column?",
+        _KILOWATTS,
+    ),
+)
+_BATTERY = (
+    _Bound("discharge_limit_w", _LIMIT, 0.05, 100.0, _KILOWATTS, _KILOWATTS),
+    _Bound("charge_limit_w", _LIMIT, 0.005, 100.0, _KILOWATTS, _KILOWATTS),
+    _Bound("resistance_ohm", _VOLTAGE, 0.0, 1.0, "", "milliohm in an ohm field, or a cell for the pack?"),
+    _Bound("ohmic_resistance_ohm", _PLANT, 0.05, 20.0, "a cell for the pack?", "milliohm in an ohm field?"),
+    _Bound(
+        "capacity_ah",
+        "Wh of pack per kg of car",
+        0.2,
+        600.0,
+        "the capacity of the whole pack is meant",
+        "Wh or mAh in an Ah field?",
+    ),
+)
 
 
 def top_speed_mps(chassis: Mapping[str, float], power_w: float) -> float:
@@ -58,118 +101,42 @@ def check_car(path: Path, params: VehicleParams, key_of: Callable[[str, str], st
     ConfigError
         It names the number, what it would mean, and the likely mistake.
     """
-    chassis, battery = params.chassis, params.battery
-    power = 2.0 * (params.front.motor.max_power_w + params.rear.motor.max_power_w)
-    checks = []
-    for axle in ("front", "rear"):
-        checks += _axle_checks(key_of(axle, "motor"), getattr(params, axle), chassis.mass_kg)
-    volt = battery.cells_in_series * battery.nominal_cell_voltage_v
-    energy_wh = volt * battery.capacity_ah
-    kilowatts = "kW in a W field?"
-    checks += [
-        _Check(
-            "battery.discharge_limit_w",
-            "of the power of all motors",
-            "",
-            battery.discharge_limit_w / power,
-            0.05,
-            100.0,
-            kilowatts,
-            kilowatts,
-        ),
-        _Check(
-            "battery.charge_limit_w",
-            "of the power of all motors",
-            "",
-            battery.charge_limit_w / power or 1.0,
-            0.005,
-            100.0,
-            kilowatts,
-            kilowatts,
-        ),
-        _Check(
-            "battery.resistance_ohm",
-            "of what the discharge limit allows at most (Voc^2 / 4 P)",
-            "",
-            battery.resistance_ohm * 4.0 * battery.discharge_limit_w / volt**2,
-            0.0,
-            1.0,
-            "",
-            "milliohm in an ohm field, or a cell for the pack?",
-        ),
-        _Check(
-            "battery.ohmic_resistance_ohm",
-            "of resistance_ohm, together with polarisation_resistance_ohm",
-            "",
-            (battery.ohmic_resistance_ohm + battery.polarisation_resistance_ohm) / battery.resistance_ohm,
-            0.05,
-            20.0,
-            "a cell for the pack?",
-            "milliohm in an ohm field?",
-        ),
-        _Check(
-            "battery.capacity_ah",
-            "of pack per kg of car",
-            "Wh",
-            energy_wh / chassis.mass_kg,
-            0.2,
-            600.0,
-            "the capacity of the whole pack is meant",
-            "Wh or mAh in an Ah field?",
-        ),
-    ]
-    for check in checks:
-        if not check.low <= check.value <= check.high:
-            meaning = f"means {check.value:.3g} {check.unit}".rstrip() + f" {check.what}"
-            likely = check.if_low if check.value < check.low else check.if_high
-            raise ConfigError(path, check.key, f"{meaning}: {likely}", f"{check.low:g} to {check.high:g}")
+    for name, axle in (("front", params.front), ("rear", params.rear)):
+        losses = "efficiency_map" if axle.motor.map_loss_w.size else "loss"
+        for bound, value in zip(_MOTOR, _motor_values(axle, params.chassis.mass_kg), strict=True):
+            _check(path, f"{key_of(name, 'motor')}.{losses if bound.key == 'loss' else bound.key}", bound, value)
+    for bound, value in zip(_BATTERY, _battery_values(params), strict=True):
+        _check(path, f"battery.{bound.key}", bound, value)
 
 
-def _axle_checks(key: str, axle: Axle, mass_kg: float) -> list[_Check]:
+def _check(path: Path, key: str, bound: _Bound, value: float) -> None:
+    if not bound.low <= value <= bound.high:
+        likely = bound.if_low if value < bound.low else bound.if_high
+        allowed = f"{bound.low:g} to {bound.high:g}"
+        raise ConfigError(path, key, f"means {value:.3g} {bound.what}: {likely}", allowed)
+
+
+def _motor_values(axle: Axle, mass_kg: float) -> tuple[float, ...]:
     motor, radius = axle.motor, axle.wheel.radius_m
-    shaft = "a torque at the motor's shaft without gear?"
-    return [
-        _Check(
-            f"{key}.max_power_w",
-            "per kg of car and motor",
-            "W",
-            motor.max_power_w / mass_kg,
-            0.5,
-            1000.0,
-            "kW in a W field?",
-            "the power of one motor is meant",
-        ),
-        _Check(
-            f"{key}.peak_torque_nm",
-            "at which peak torque takes all of max_power_w",
-            "m/s",
-            radius * motor.max_power_w / motor.peak_torque_nm,
-            0.5,
-            80.0,
-            "kW in a W field, or the torque of the whole car?",
-            shaft,
-        ),
-        _Check(
-            f"{key}.peak_torque_nm",
-            "g of this axle alone",
-            "",
-            2.0 * motor.peak_torque_nm / radius / (mass_kg * _GRAVITY_MPS2),
-            0.01,
-            5.0,
-            shaft,
-            "the torque of one motor is meant",
-        ),
-        _Check(
-            f"{key}.{'efficiency_map' if motor.map_loss_w.size else 'loss'}",
-            "efficiency at half of peak torque and full power",
-            "",
-            _efficiency(motor),
-            0.2,
-            0.9995,
-            "losses of all motors, or rpm in a rad/s column?",
-            "kW in a W field?",
-        ),
-    ]
+    return (
+        motor.max_power_w / mass_kg,
+        radius * motor.max_power_w / motor.peak_torque_nm,
+        2.0 * motor.peak_torque_nm / radius / (mass_kg * _GRAVITY_MPS2),
+        _efficiency(motor),
+    )
+
+
+def _battery_values(params: VehicleParams) -> tuple[float, ...]:
+    battery = params.battery
+    power = 2.0 * (params.front.motor.max_power_w + params.rear.motor.max_power_w)
+    volt = battery.cells_in_series * battery.nominal_cell_voltage_v
+    return (
+        battery.discharge_limit_w / power,
+        battery.charge_limit_w / power or 1.0,
+        battery.resistance_ohm * 4.0 * battery.discharge_limit_w / volt**2,
+        (battery.ohmic_resistance_ohm + battery.polarisation_resistance_ohm) / battery.resistance_ohm,
+        volt * battery.capacity_ah / params.chassis.mass_kg,
+    )
 
 
 def _efficiency(motor: Motor) -> float:
