@@ -26,10 +26,12 @@ from scipy.optimize import minimize, minimize_scalar
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.model.parameters import Battery
-from iwm_power_manager.vehicle import nominal_voltage_v, with_params
+from iwm_power_manager.vehicle import Vehicle, nominal_voltage_v, with_params
 from iwm_sim import closed_loop
 from iwm_sim.study import cases
 from iwm_sim.study.cases import Case
+from iwm_sim.study.report import Column
+from iwm_sim.study.tables import plain_table
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -67,46 +69,42 @@ class Comparison(NamedTuple):
     model_soc: FloatArray
 
 
+#: Columns of a table of circuits, by their names.
+COLUMNS: tuple[Column[tuple[str, Estimate]], ...] = (
+    Column("Control model", lambda row: CIRCUITS[row[0]]),
+    Column("Resistance", lambda row: row[1].resistance_ohm, "Ω", 4),
+    Column("Voltage", lambda row: row[1].voltage_v, "V", 2),
+    Column("RMSE", lambda row: 100.0 * row[1].rmse, "% SoC", 5),
+)
+
+
 class Fit(NamedTuple):
     """Result of the estimation.
 
     Attributes
     ----------
-    nominal : resistance fitted, voltage nominal
-    plant : resistance fitted, voltage the plant's mean open-circuit voltage
-    free : both fitted
-    file : the circuit the vehicle's file has, for comparison
+    estimates : by the names of `CIRCUITS`
     comparison : of the first cycle, with `plant` (Fig. 7)
     idle_drive : of the car
     """
 
-    nominal: Estimate
-    plant: Estimate
-    free: Estimate
-    file: Estimate
+    estimates: dict[str, Estimate]
     comparison: Comparison
     idle_drive: str
 
     def text(self) -> str:
         """The result in lines for a terminal."""
-        names = list(self.nominal.rmse_by_cycle)
-        head = f"{'circuit':<38}{'R, ohm':>10}{'Voc, V':>10}{'RMSE, % SoC':>14}" + "".join(f"{n:>12}" for n in names)
-        lines = [head]
-        for name, made in self.estimates().items():
-            lines.append(
-                f"{CIRCUITS[name]:<38}{made.resistance_ohm:>10.4f}{made.voltage_v:>10.2f}{100.0 * made.rmse:>14.5f}"
-                + "".join(f"{100.0 * made.rmse_by_cycle[n]:>12.5f}" for n in names)
-            )
-        lines.append(f"the paper's estimate: {PAPER_RESISTANCE_OHM} ohm")
-        return "\n".join(lines)
 
-    def estimates(self) -> dict[str, Estimate]:
-        """The four circuits by name."""
-        return {"nominal": self.nominal, "plant": self.plant, "free": self.free, "file": self.file}
+        def rmse_on(name: str) -> Column[tuple[str, Estimate]]:
+            return Column(name, lambda row: 100.0 * row[1].rmse_by_cycle[name], "% SoC", 5, "RMSE on")
+
+        columns = [*COLUMNS, *map(rmse_on, self.estimates["file"].rmse_by_cycle)]
+        table = plain_table(list(self.estimates.items()), columns)
+        return f"{table}\nthe paper's estimate: {PAPER_RESISTANCE_OHM} ohm"
 
     def to_json(self) -> dict[str, Any]:
         """The estimates as plain values, with the paper's beside them."""
-        made = {name: estimate._asdict() for name, estimate in self.estimates().items()}
+        made = {name: estimate._asdict() for name, estimate in self.estimates.items()}
         return {**made, "paper_resistance_ohm": PAPER_RESISTANCE_OHM}
 
 
@@ -123,12 +121,13 @@ def fit(
     vehicle: str, idle_drive: str = "", cycles: Sequence[str] = CYCLES, friction: float = 0.9, soc: float = 0.8
 ) -> Fit:
     """Drive the cycles with the plant and equal split, and fit the static circuit to it."""
+    driven = [Case(cycle, vehicle, idle_drive, friction, "equal", soc=soc) for cycle in cycles]
     runs = {}
-    for cycle in cycles:
-        case = Case(cycle, vehicle, idle_drive, friction, "equal", soc=soc)
+    for case in driven:
         cases.check(case)
-        runs[cases.cycle_of(cycle).name] = cases.drive(case)
-    battery = cases.vehicle_of(vehicle, idle_drive).params.battery
+        runs[cases.cycle_of(case.cycle).name] = cases.drive(case)
+    car = cases.vehicle_of(vehicle, idle_drive)
+    battery = car.params.battery
     nominal_v = nominal_voltage_v(battery)
 
     def estimate(resistance_ohm: float, voltage_v: float) -> Estimate:
@@ -159,12 +158,14 @@ def fit(
     cells_v = np.interp(np.concatenate([run["soc"] for run in runs.values()]), battery.ocv_soc, battery.ocv_cell_v)
     plant = fitted_at(battery.cells_in_series * float(np.mean(cells_v)))
     return Fit(
-        nominal=fitted_at(nominal_v),
-        plant=plant,
-        free=estimate(both.x[0], both.x[1] * nominal_v),
-        file=estimate(battery.resistance_ohm, nominal_v),
-        comparison=_comparison(vehicle, idle_drive, cycles[0], friction, soc, runs, plant, battery),
-        idle_drive=cases.vehicle_of(vehicle, idle_drive).idle_drive,
+        estimates={
+            "nominal": fitted_at(nominal_v),
+            "plant": plant,
+            "free": estimate(both.x[0], both.x[1] * nominal_v),
+            "file": estimate(battery.resistance_ohm, nominal_v),
+        },
+        comparison=_comparison(driven[0], next(iter(runs.values())), plant, car),
+        idle_drive=car.idle_drive,
     )
 
 
@@ -177,19 +178,9 @@ def _squared_errors(run: closed_loop.Run, resistance_ohm: float, voltage_v: floa
     return error
 
 
-def _comparison(
-    vehicle: str,
-    idle_drive: str,
-    cycle: str,
-    friction: float,
-    soc: float,
-    runs: dict[str, closed_loop.Run],
-    circuit: Estimate,
-    battery: Battery,
-) -> Comparison:
+def _comparison(case: Case, plant: closed_loop.Run, circuit: Estimate, car: Vehicle) -> Comparison:
     """The plant beside the control model: the same car with the static circuit and motors that do not heat up."""
-    plant = runs[cases.cycle_of(cycle).name]
-    params = cases.vehicle_of(vehicle, idle_drive).params
+    battery = car.params.battery
     cell_v = circuit.voltage_v / battery.cells_in_series
     static = battery._replace(
         ocv_cell_v=np.full_like(battery.ocv_cell_v, cell_v),
@@ -197,17 +188,14 @@ def _comparison(
         ohmic_factor_at_10_percent=1.0,
         polarisation_resistance_ohm=0.0,
     )
-    motor = params.front.motor._replace(continuous_torque_nm=params.front.motor.peak_torque_nm)
+    motor = car.params.front.motor
+    cold = motor._replace(continuous_torque_nm=motor.peak_torque_nm)
     model = closed_loop.run(
-        cases.cycle_of(cycle),
-        with_params(
-            cases.vehicle_of(vehicle, idle_drive),
-            "control model",
-            params._replace(battery=static).with_axles(motor=motor),
-        ),
+        cases.cycle_of(case.cycle),
+        with_params(car, "control model", car.params._replace(battery=static).with_axles(motor=cold)),
         default_settings("equal"),
         empty_table(),
-        friction,
-        soc=soc,
+        case.friction,
+        soc=case.soc,
     )
     return Comparison(plant["time_s"], plant["speed_mps"], model["speed_mps"], plant["soc"], model["soc"])

@@ -158,7 +158,7 @@ def _study(
         stops=stops,
         frontier=frontier_of(plan.frontier[0], rows_of(results[tables : tables + len(plan.frontier)])),
         robustness=_robustness_rows([name for name, _ in plan.robustness], results[tables + len(plan.frontier) :]),
-        battery_fit=battery.estimates(),
+        battery_fit=battery.estimates,
         sensitivity=_sensitivity(car.params),
         ablation=ablated,
         paper=paper.consequences(

@@ -404,17 +404,11 @@ def _in_cycle(name: str) -> Callable[[Robustness], float | None]:
 
 def battery_table(study: Study) -> TableOf:
     """The fitted circuits (eq. 25)."""
-    columns: tuple[Column[tuple[str, battery_fit.Estimate]], ...] = (
-        Column("Control model", lambda row: battery_fit.CIRCUITS[row[0]]),
-        Column("Resistance", lambda row: row[1].resistance_ohm, "Ω", 4),
-        Column("Voltage", lambda row: row[1].voltage_v, "V", 2),
-        Column("RMSE", lambda row: 100.0 * row[1].rmse, "% SoC", 5),
-    )
     over = " and ".join(study.battery_fit["file"].rmse_by_cycle)
     return TableOf(
         BATTERY,
         "",
-        columns,
+        battery_fit.COLUMNS,
         list(study.battery_fit.items()),
         f"The paper's estimate is {battery_fit.PAPER_RESISTANCE_OHM} Ω. RMSE with the 1/N that eq. 25 lacks, over "
         f"{over}.",

@@ -33,13 +33,14 @@ def test_more_resistance_depletes_more_in_driving_and_charges_less_in_braking():
 
 def test_the_fit_is_a_minimum_and_the_error_has_its_1_over_n(hill):
     fit = battery_fit.fit("jalalmaab_2015", "none", [str(hill)])
-    for estimate in (fit.plant, fit.nominal):
-        assert estimate.rmse <= fit.file.rmse or estimate is fit.plant
+    nominal, plant, free, file = (fit.estimates[name] for name in battery_fit.CIRCUITS)
+    for estimate in (plant, nominal):
+        assert estimate.rmse <= file.rmse or estimate is plant
         assert estimate.rmse == pytest.approx(estimate.rmse_by_cycle["hill"])
-    assert fit.free.rmse <= min(fit.plant.rmse, fit.nominal.rmse) * (1.0 + 1e-3)
-    assert fit.plant.voltage_v > fit.nominal.voltage_v  # an LFP cell at 80 % stands above 3.3 V
+    assert free.rmse <= min(plant.rmse, nominal.rmse) * (1.0 + 1e-3)
+    assert plant.voltage_v > nominal.voltage_v  # an LFP cell at 80 % stands above 3.3 V
     comparison = fit.comparison
     assert len(comparison.time_s) == len(comparison.model_soc) == len(comparison.plant_speed_mps)
     assert np.abs(comparison.plant_speed_mps - comparison.model_speed_mps).max() < 0.05
     shown = fit.text()
-    assert f"{fit.plant.resistance_ohm:.4f}" in shown
+    assert f"{plant.resistance_ohm:.4f}" in shown

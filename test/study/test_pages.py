@@ -38,7 +38,7 @@ def material():
     estimate = battery_fit.Estimate(0.05, 240.0, 1e-5, {"hill": 1e-5})
     comparison = battery_fit.Comparison(time, wave, wave, 0.8 - time / 1e4, 0.8 - time / 1e4)
     return Material(
-        battery=battery_fit.Fit(estimate, estimate, estimate, estimate, comparison, "none"),
+        battery=battery_fit.Fit(dict.fromkeys(battery_fit.CIRCUITS, estimate), comparison, "none"),
         rule=Rule((0.0, 0.6, 0.0, 0.4), 1e3 * wave, np.abs(wave)),
         convergence=(np.array([10.0, 1.0, 0.0]), np.array([1.0, 0.1, 0.01])),
         window=window,
