@@ -6,9 +6,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from iwm_power_manager.mdp.demand import DemandChain
+
 VEHICLE = "jalalmaab_2015"
+#: Two demands, 0 and 1 kW.
+CHAIN = DemandChain(np.array([0.0, 1e3]), np.array([[0.9, 0.1], [0.0, 1.0]]), np.zeros((0, 2, 2)), np.full(2, 1e3), 0.0)
 
 #: A coarse problem that solves at once.
 SMALL_GRID = """

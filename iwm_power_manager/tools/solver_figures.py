@@ -39,7 +39,9 @@ def draw_demand(axes: Axes, chain: DemandChain) -> None:
         np.ma.masked_less_equal(chain.probability, 0.0),
         norm=LogNorm(1e-4, 1.0),
         shading="nearest",
-        cmap="viridis",
+        cmap="cividis",
+        # Thousands of cells as vector would be megabytes.
+        rasterized=True,
     )
     axes.figure.colorbar(image, ax=axes, label="probability")
     for rows, marker, label in (

@@ -14,11 +14,12 @@ from typing import Any, NamedTuple, cast
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
+from iwm_power_manager.mdp.demand import DemandChain
+from iwm_power_manager.tools.solver_figures import draw_demand
 from iwm_sim.study.palette import COLOURS, INK
 
 #: Narrow enough that its text stays readable when the page scales it to a phone.
@@ -251,30 +252,13 @@ def _by_axle(
 
 
 @_styled
-def transition_matrix(probability: ArrayLike, power_w: ArrayLike) -> Figure:
-    """The demand's transition matrix (N, N), rows summing to one, over its grid of power (N,), W."""
-    matrix = np.asarray(probability, dtype=np.float64)
-    power_kw = np.asarray(power_w, dtype=np.float64) / 1000.0
+def transition_matrix(chain: DemandChain) -> Figure:
+    """The demand's transition matrix over its grid of power."""
     figure, (axis,) = _axes(1, height_in=4.3)
-    positive = matrix[matrix > 0.0]
-    # A grid point stands in the middle of its cell; the outermost cells are as wide as their neighbours.
-    outer = (2.0 * power_kw[0] - power_kw[1], 2.0 * power_kw[-1] - power_kw[-2])
-    centres = np.concatenate((outer[:1], power_kw, outer[1:]))
-    edges = (centres[1:] + centres[:-1]) / 2.0
-    image = axis.pcolormesh(
-        edges,
-        edges,
-        np.ma.masked_less_equal(matrix, 0.0),
-        cmap="cividis",
-        norm=LogNorm(float(positive.min()), 1.0),
-        rasterized=True,
-    )
+    draw_demand(axis, chain)
+    axis.set_title("")
     axis.set_aspect("equal")
     axis.grid(visible=False)
-    axis.set_xlabel("Power demand one step later, kW")
-    axis.set_ylabel("Power demand now, kW")
-    bar = figure.colorbar(image, ax=axis, shrink=0.9)
-    bar.set_label("Probability")
     return figure
 
 

@@ -92,7 +92,7 @@ def study(
         rule=rules[key],
         convergence=convergence_of(solved),
         window=window_of(made[:-2]),
-        chain=(solved.chain.probability, solved.chain.power_w),
+        chain=solved.chain,
     )
     pages.write(output, content, drawn(content.frontier, material, policies.car(IDLE_DRIVES[0]).params))
     atomic_write(output / "study.json", stored)

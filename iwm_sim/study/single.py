@@ -92,8 +92,7 @@ def figure(name: str, policies: Policies, jobs: int = 1) -> Drawn:
         return depletion_figures(policies.car(IDLE_DRIVES[0]).params)[int(name) - 8]
     if name in ("12", "transitions"):
         policy = cases.policy_of(policies.of_variant(labels.PAPER_SDP, *first))
-        chain = (policy.chain.probability, policy.chain.power_w)
-        return solver_figures(convergence_of(policy), chain)[name == "transitions"]
+        return solver_figures(convergence_of(policy), policy.chain)[name == "transitions"]
     if name == "13":
         return rule_figure(fitted_rules(policies.vehicle, [first], jobs)[first])
     if name in ("14", "15"):

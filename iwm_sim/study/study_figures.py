@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
+from iwm_power_manager.mdp.demand import DemandChain
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.policy import Policy
 from iwm_sim.metrics import CRITICAL_SLIP
@@ -36,14 +37,14 @@ class Material(NamedTuple):
     battery, rule : fitted
     convergence : change of the policy and Bellman residual in each iteration
     window : series of the watched runs, by label
-    chain : transition matrix of the demand, and its axis, W
+    chain : of the demand
     """
 
     battery: battery_fit.Fit
     rule: Rule
     convergence: tuple[FloatArray, FloatArray]
     window: dict[str, dict[str, FloatArray]]
-    chain: tuple[FloatArray, FloatArray]
+    chain: DemandChain
 
 
 class Drawn(NamedTuple):
@@ -114,7 +115,7 @@ def depletion_figures(vehicle: VehicleParams) -> list[Drawn]:
     ]
 
 
-def solver_figures(convergence: tuple[FloatArray, FloatArray], chain: tuple[FloatArray, FloatArray]) -> list[Drawn]:
+def solver_figures(convergence: tuple[FloatArray, FloatArray], chain: DemandChain) -> list[Drawn]:
     """Figure 12, and the chain it was solved with."""
     return [
         Drawn(
@@ -129,7 +130,7 @@ def solver_figures(convergence: tuple[FloatArray, FloatArray], chain: tuple[Floa
             "transition_matrix",
             "Demand as a Markov chain",
             "Transition matrix of the paper's problem, a step of 0.1 s, from FTP-75, HWFET and NYCC.",
-            figures.transition_matrix(*chain),
+            figures.transition_matrix(chain),
             PROGRAM,
         ),
     ]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from iwm_sim.study import figures as f
+from study_fixtures import CHAIN
 
 TIME = np.arange(0.0, 100.0, 0.5)
 WAVE = np.sin(TIME)
@@ -22,7 +23,7 @@ def built():
         "fig13": f.fitted_rule(1e3 * WAVE, 600.0 * WAVE, [-1e3, 1e3], [-600.0, 600.0]),
         "fig14": f.axle_powers(TIME, [f.AxleRun("sdp", 1e3 * WAVE, 2e3 * WAVE)], (20.0, 40.0)),
         "fig15": f.slips(TIME, [f.AxleRun("with", WAVE, WAVE), f.AxleRun("without", WAVE, WAVE)], 0.2),
-        "transitions": f.transition_matrix(np.array([[0.9, 0.1], [0.0, 1.0]]), [0.0, 1e3]),
+        "transitions": f.transition_matrix(CHAIN),
         "frontier": f.switching_frontier({"ours": ([4.0, 6.0], [2.3, 2.45]), "preview": ([0.0, 7.0], [0.0, 2.47])}),
     }
 
@@ -33,7 +34,7 @@ def figures():
 
 
 def test_every_number_axis_is_labelled_with_its_unit(figures):
-    unitless = {"Iteration", "Change of shares", "(a) Front slip", "(b) Rear slip", "Probability", ""}
+    unitless = {"Iteration", "Change of shares", "(a) Front slip", "(b) Rear slip", "probability", ""}
     for name, figure in figures.items():
         labels = [axis.get_ylabel() for axis in figure.axes] + [axis.get_xlabel() for axis in figure.axes]
         assert figure.axes[0].get_ylabel(), name

@@ -18,6 +18,7 @@ from iwm_sim.study.content import Study
 from iwm_sim.study.report import anchor, render
 from iwm_sim.study.rows import Place, Row, by_place
 from iwm_sim.study.study_figures import Material, drawn
+from study_fixtures import CHAIN
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -42,7 +43,7 @@ def material():
         rule=Rule((0.0, 0.6, 0.0, 0.4), 1e3 * wave, np.abs(wave)),
         convergence=(np.array([10.0, 1.0, 0.0]), np.array([1.0, 0.1, 0.01])),
         window=window,
-        chain=(np.array([[0.9, 0.1], [0.5, 0.5]]), np.array([0.0, 1e3])),
+        chain=CHAIN,
     )
 
 
