@@ -85,6 +85,7 @@ setup(
     install_requires=[
         "jinja2",
         "apsw",
+        "distributed",
         "lz4",
         "matplotlib",
         "mcap",
@@ -103,8 +104,8 @@ setup(
         "test": ["pytest"],
         # A DataFrame of a drive (`iwm_sim.api`).
         "frame": ["pandas"],
-        # Studies on all cores or a cluster (`fleet`).
-        "fleet": ["distributed", "pyarrow"],
+        # The rows of `fleet`.
+        "fleet": ["pyarrow"],
         # The page of `watch_car`.
         "watch": ["bokeh"],
     },

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a fleet study costs beside its drives: 1,000 drives with 1, 2 and many workers, near and far.
+"""What a fleet study costs beside its drives: 1,000 drives with 1, 2 and many workers, near and far, and one killed.
 
 Each setting drives the same places in a new folder and compares the rows with those of one process. What is measured
  holds on a busy machine, too: seconds of the processor, and the part of its time that a worker spends in tasks
 (a task that waits for a processor others use is still in it). Far workers reach their scheduler, a process of its own,
-through a relay that holds back every byte for a while, both ways.
+through a relay that holds back every byte for a while, both ways. On two cores with nothing beside it, it takes five
+minutes.
 
 `--json docs/scale.json` stores what was measured; `--page docs/scale.md` writes the table into the page, with
 `--json FILE --stored` from the stored numbers.
@@ -19,6 +20,7 @@ import json
 import multiprocessing
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -26,9 +28,29 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
-#: Workers, one-way latency in ms, and seconds of work in a batch (0: one place each).
-SETTINGS = ((1, 0, 2.0), (2, 0, 2.0), (2, 0, 0.0), (8, 50, 0.0), (8, 50, 2.0))
+from tqdm import tqdm
+
+
+class Setting(NamedTuple):
+    """Workers, one-way latency, seconds of work in a batch (0: one place each), and whether one is killed half-way."""
+
+    workers: int
+    latency_ms: int
+    batch_s: float
+    killed: bool = False
+
+
+NEAR = Setting(2, 0, 2.0)
+SETTINGS = (
+    Setting(1, 0, 2.0),
+    NEAR,
+    NEAR._replace(killed=True),
+    Setting(2, 0, 0.0),
+    Setting(8, 50, 0.0),
+    Setting(8, 50, 2.0),
+)
 HZ = 100
 FLEET = {
     "format": 1,
@@ -130,32 +152,41 @@ def processor_s(client) -> dict[str, float]:
     return used
 
 
-def measure(setting, plan, folder: Path, expected) -> dict[str, float]:
+def measure(setting: Setting, plan, folder: Path, expected) -> dict[str, Any]:
     """Drive the plan with a setting."""
-    from iwm_sim.fleet.run import Runner, connected
+    from iwm_sim.cluster import connected
+    from iwm_sim.fleet.run import Runner
     from iwm_sim.fleet.store import Store
     from iwm_sim.fleet.task import Drive, fingerprint
 
-    workers, latency_ms, batch_s = setting
+    workers, latency_ms, batch_s, killed = setting
+    left = [len(plan.drives) // 2] if killed else []
     far = far_cluster(workers, latency_ms / 1000.0) if latency_ms else contextlib.nullcontext(None)
     store = Store(folder)
-    with far as address, connected(address, workers) as client:
+    words = f"{workers} workers, {latency_ms} ms, {batch_s:g} s{', one killed' if killed else ''}"
+    with far as address, connected(address, workers) as client, _progress(plan, words) as bar:
+
+        def done(count: int) -> None:
+            bar.update(count)
+            if left and bar.n >= left[0]:
+                left.clear()
+                os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
+
         client.wait_for_workers(workers, timeout=300)
         running = Runner(store, store.begin(fingerprint(), plan.files), client, batch_s)
         running.check_workers(lambda _: None)
         rss_mb = max(client.run(lambda: __import__("psutil").Process().memory_info().rss).values()) / 2**20
         before = processor_s(client)
-        made = running.run(Drive, plan.drives)
+        made = running.run(Drive, plan.drives, done)
+        client.wait_for_workers(workers, timeout=300)
         after = processor_s(client)
     assert store.table(Drive).equals(expected), "the rows differ from those of one process"
-    used = {name: after[name] - before[name] for name in after}
+    used = {name: after[name] - before.get(name, 0.0) for name in after}
     served = used.pop("here") + used.pop("scheduler", 0.0)
     in_tasks_s = sum(_took(path)["wall_s"] for path in (folder / "rows").iterdir())
     idle_s = workers * made.wall_s - in_tasks_s
-    return {
-        "workers": workers,
-        "latency_ms": latency_ms,
-        "batch_s": batch_s,
+    cores = min(workers, len(os.sched_getaffinity(0)))
+    return setting._asdict() | {
         "batches": made.batches,
         "task_cpu_s": made.cpu_s,
         "wall_s": made.wall_s,
@@ -163,8 +194,13 @@ def measure(setting, plan, folder: Path, expected) -> dict[str, float]:
         "scheduler_cpu_s": served,
         "idle_ms_per_batch": 1000.0 * idle_s / made.batches,
         "in_tasks_percent": 100.0 * in_tasks_s / (workers * made.wall_s),
+        "busy_percent": 100.0 * (sum(used.values()) + served) / (cores * made.wall_s),
         "worker_mb": rss_mb,
     }
+
+
+def _progress(plan, words: str) -> tqdm:
+    return tqdm(total=len(plan.drives), unit="place", desc=words, file=sys.stderr)
 
 
 def _took(path: Path) -> dict[str, float]:
@@ -183,16 +219,16 @@ def run(drives: int) -> dict:
     from iwm_sim.study import cases
     from iwm_sim.study.cases import Case
 
-    cycles = drives // 20
+    load, cycles = os.getloadavg()[0], drives // 20
     plan = plan_of("benchmark", FLEET | {"cycles": f"generated:1000..{999 + cycles}"})
     with tempfile.TemporaryDirectory() as folder:
         store = Store(Path(folder) / "serial")
-        with runner(store, plan.files, None, 1, 2.0) as running:
-            alone = running.run(Drive, plan.drives)
-        rows = []
-        for number, setting in enumerate(SETTINGS):
-            rows.append(measure(setting, plan, Path(folder) / str(number), store.table(Drive)))
-            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+        with runner(store, plan.files, None, 1, 2.0) as running, _progress(plan, "this process") as bar:
+            alone = running.run(Drive, plan.drives, bar.update)
+        rows = [
+            measure(setting, plan, Path(folder) / str(number), store.table(Drive))
+            for number, setting in enumerate(SETTINGS)
+        ]
     real = {}
     for strategy in ("equal", "instantaneous_slip"):
         case = Case("config/cycles/udds.csv", cases.BASE_CAR, "drag", 0.9, strategy)
@@ -205,7 +241,7 @@ def run(drives: int) -> dict:
         "hz": HZ,
         "cores": len(os.sched_getaffinity(0)),
         "processor": fingerprint()["processor"],
-        "load": os.getloadavg()[2],
+        "load": load,
         "serial_cpu_s": alone.cpu_s,
         "udds_cpu_s": real,
         "settings": rows,
@@ -218,45 +254,37 @@ def run(drives: int) -> dict:
 def text(found: dict) -> str:
     """The table and what follows from it, in Markdown."""
     rows = found["settings"]
-    each_ms = 1000.0 * found["serial_cpu_s"] / found["drives"]
-    lines = [
-        f"{found['drives']} drives (drawn cars and cycles of 300 s, control at {found['hz']} Hz, {each_ms:.1f} ms of "
-        f"processor each) on {found['cores']} cores ({found['processor']}), which other work shared (load "
-        f"{found['load']:.0f} over 15 minutes); every setting gave the rows of one process, bit for bit. "
-        "`python benchmarks/fleet.py`:",
-        "",
-        "| workers | network | batch | batches | drives per second of processor | scheduler and client, s of processor "
-        "| worker beside its tasks, ms a batch | worker idle, ms a batch | of its time in tasks |",
-        "|---:|---|---|---:|---:|---:|---:|---:|---:|",
-    ]
-    for row in rows:
-        network = f"{row['latency_ms']} ms each way" if row["latency_ms"] else "this machine"
-        batch = f"{row['batch_s']:g} s at most" if row["batch_s"] else "one place"
-        per_s = found["drives"] / row["task_cpu_s"]
-        lines.append(
-            f"| {row['workers']} | {network} | {batch} | {row['batches']} | {per_s:.0f} "
-            f"| {row['scheduler_cpu_s']:.1f} | {row['worker_cpu_ms_per_batch']:.1f} "
-            f"| {row['idle_ms_per_batch']:.0f} | {row['in_tasks_percent']:.1f} % |"
-        )
     near, far = (
         next(row for row in rows if bool(row["latency_ms"]) == away and not row["batch_s"]) for away in (False, True)
     )
+    both = {row["killed"]: row for row in rows if [row[name] for name in ("workers", "batch_s")] == [2, 2.0]}
     hidden_s = [(row["worker_cpu_ms_per_batch"] + row["idle_ms_per_batch"]) / 1000.0 / ALLOWED for row in (near, far)]
     served_ms = 1000.0 * near["scheduler_cpu_s"] / near["batches"]
     real_s = sum(found["udds_cpu_s"].values()) / 2.0
     hours, batches = 1e5 * real_s / 3600.0, 1e5 * real_s / 2.0
-    most = max(row["in_tasks_percent"] for row in rows)
-    lines += [
+    lost_s = both[True]["wall_s"] - both[False]["wall_s"]
+    lines = [
+        f"{found['drives']} drives (drawn cars and cycles of 300 s, control at {found['hz']} Hz, "
+        f"{1000.0 * found['serial_cpu_s'] / found['drives']:.1f} ms of processor each) on {found['cores']} cores "
+        f"({found['processor']}), load {found['load']:.1f} before it began; every setting gave the rows of one "
+        "process, bit for bit. `python benchmarks/fleet.py`:",
         "",
-        f"- **Workers at work**: {most:.1f} % of their time at best, start and end of the study included. Under this "
-        "load client and scheduler wait for a processor like everybody else, and their workers for them.",
+        "| workers | network | batch | batches | drives a second, each core | drives per second of processor "
+        "| scheduler and client, s of processor | worker beside its tasks, ms a batch | worker idle, ms a batch "
+        "| of its time in tasks | cores busy |",
+        "|---|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+        *(_line(row, found) for row in rows),
+        "",
+        f"- **Workers at work**: {both[False]['in_tasks_percent']:.1f} % of their time with two of them, start and end "
+        f"of the study included; the cores are busy for {both[False]['busy_percent']:.1f} % of it.",
         f"- **What a batch costs beside its work**: {near['worker_cpu_ms_per_batch']:.1f} ms of the worker's processor "
         f"and {served_ms:.1f} ms of scheduler and client, the Parquet file included. A worker waits "
         f"{near['idle_ms_per_batch']:.0f} ms for its next batch on this machine, {far['idle_ms_per_batch']:.0f} ms "
         "over the slow network.",
-        f"- **The batch that hides it** to {100 * ALLOWED:g} %, waiting under this load included: "
-        f"{hidden_s[0]:.1f} s on one machine, {hidden_s[1]:.1f} s far "
-        "away (`--batch`; 2 s is the default).",
+        f"- **The batch that hides it** to {100 * ALLOWED:g} %: {hidden_s[0]:.1f} s on one machine, "
+        f"{hidden_s[1]:.1f} s far away (`--batch`; 2 s is the default).",
+        f"- **A killed worker**, one of two, half-way: {both[True]['wall_s']:.1f} s instead of "
+        f"{both[False]['wall_s']:.1f}, {lost_s:.1f} s lost. Its batches are done again, and another worker is started.",
         f"- **One scheduler feeds** about {2000.0 / served_ms:.0f} workers with batches of 2 s; more want larger ones.",
         f"- **100,000 drives** of UDDS at 100 Hz, half with equal split, half with `instantaneous_slip`, take "
         f"{hours:.1f} hours of processor ({real_s:.2f} s a drive): {60 * hours / 2:.0f} minutes on 2 cores, "
@@ -264,6 +292,19 @@ def text(found: dict) -> str:
         f"{batches * served_ms / 60e3:.1f} minutes. A worker takes {max(row['worker_mb'] for row in rows):.0f} MB.",
     ]
     return "\n".join(lines)
+
+
+def _line(row: dict, found: dict) -> str:
+    """A setting's line of the table."""
+    cores = min(row["workers"], found["cores"])
+    return (
+        f"| {row['workers']}{', one killed' if row['killed'] else ''} "
+        f"| {f'{row["latency_ms"]} ms each way' if row['latency_ms'] else 'this machine'} "
+        f"| {f'{row["batch_s"]:g} s at most' if row['batch_s'] else 'one place'} | {row['batches']} "
+        f"| {found['drives'] / row['wall_s'] / cores:.1f} | {found['drives'] / row['task_cpu_s']:.1f} "
+        f"| {row['scheduler_cpu_s']:.1f} | {row['worker_cpu_ms_per_batch']:.1f} | {row['idle_ms_per_batch']:.0f} "
+        f"| {row['in_tasks_percent']:.1f} % | {row['busy_percent']:.1f} % |"
+    )
 
 
 def main() -> None:

@@ -34,7 +34,7 @@ from iwm_power_manager.solve import solve_one
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import learning
 from iwm_sim.closed_loop import run
-from iwm_sim.study.driving import on_all_cores
+from iwm_sim.cluster import on_all_cores
 from iwm_sim.study.names import cores
 
 CAR = "config/vehicles/jalalmaab_2015.yaml"

@@ -15,13 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from iwm_sim.closed_loop import Run
+from iwm_sim.cluster import on_all_cores
 from iwm_sim.metrics import Metrics
 from iwm_sim.road_measures import MEASURES, driven
 from iwm_sim.road_run import drive_scenario
 from iwm_sim.scenario import Demand, Friction, Scenario, load_scenario
 from iwm_sim.study import paper
 from iwm_sim.study.cases import Case
-from iwm_sim.study.driving import drive_all, on_all_cores
+from iwm_sim.study.driving import drive_all
 from iwm_sim.study.names import REFERENCE
 from iwm_sim.study.plan import IDLE_DRIVES, STRATEGY, Policies
 from iwm_sim.study.rows import saving_percent

@@ -36,8 +36,8 @@ from iwm_power_manager.replay.recorded import RecordedDrive
 from iwm_power_manager.solve import solve_one
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import closed_loop
+from iwm_sim.cluster import on_all_cores
 from iwm_sim.metrics import measure
-from iwm_sim.study.driving import on_all_cores
 
 #: Weights of a recorded second beside a second of a cycle. 0: the cycles alone; infinite: the recording alone.
 CYCLES_ALONE, RECORDING_ALONE = 0.0, math.inf

@@ -31,12 +31,11 @@ from iwm_sim.metrics import Metrics, measure
 from iwm_sim.scenario import load_scenario
 from iwm_sim.study import cases
 from iwm_sim.study.cases import Case, Change
-from iwm_sim.study.driving import effort
+from iwm_sim.study.driving import seconds_of
 from iwm_sim.study.policies import solved
 from iwm_sim.study.rows import rows_of
 
-#: Of a processor, for a unit of `effort`; to fill batches, no promise.
-_SECONDS_PER_EFFORT = 1e-6
+#: Of a processor; to fill batches, no promise.
 _SECONDS_PER_POLICY = 10.0
 _SECONDS_PER_SCENARIO = 2.0
 
@@ -160,7 +159,7 @@ class Drive(NamedTuple):
     @property
     def seconds(self) -> float:
         """About how long it takes."""
-        return _SECONDS_PER_EFFORT * sum(effort(case) for case in self.cases)
+        return sum(seconds_of(case) for case in self.cases)
 
     def run(self, folder: Path) -> Made:
         """Drive all of them, with the policies of a folder."""

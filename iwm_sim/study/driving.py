@@ -5,68 +5,26 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import multiprocessing
-import signal
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from typing import Any, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
 from iwm_power_manager import kernel_cache
+from iwm_sim.cluster import on_all_cores
 from iwm_sim.study import cases
 from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result
-
-Item = TypeVar("Item")
-Made = TypeVar("Made")
 
 #: How long a strategy takes beside equal split.
 _WEIGHTS = {"equal": 1.0, "rule": 1.0, "sdp": 1.5, "instantaneous": 2.0, "preview": 4.0}
 _OTHER_WEIGHT = 3.0
+_SECONDS_PER_STEP = 1e-6
+#: Of work: a process takes two seconds to come up, with what it imports.
+_WORTH_A_PROCESS_S = 5.0
 
 #: Long enough to run through every kernel of a drive.
 _WARM_UP_S = 0.1
-
-
-def on_all_cores(
-    function: Callable[[Item], Made], items: Sequence[Item], jobs: int, done: Callable[[Made], object] = lambda _: None
-) -> list[Made]:
-    """`[function(item) for item in items]`, on `jobs` processes; `done` hears of each as it is ready.
-
-    Parameters
-    ----------
-    function : can be pickled, as can the items
-    items : the longest first gives the least idle time at the end
-    jobs : processes; 1 stays in this one
-    """
-    made: dict[int, Made] = {}
-    workers = min(jobs, len(items))
-    if workers <= 1:
-        for index, item in enumerate(items):
-            made[index] = function(item)
-            done(made[index])
-        return list(made.values())
-    # Not forked: a fork copies the locks of threads, but not the threads that would release them.
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _leave_interrupts_to_the_parent)
-    try:
-        futures = {pool.submit(function, item): index for index, item in enumerate(items)}
-        for future in as_completed(futures):
-            index = futures[future]
-            made[index] = future.result()
-            done(made[index])
-    except BaseException:
-        for process in list((pool._processes or {}).values()):
-            process.terminate()
-        # The pool's own thread collects what was ended; a second collector would race with it.
-        pool.shutdown(wait=True, cancel_futures=True)
-        raise
-    pool.shutdown()
-    return [made[index] for index in range(len(items))]
-
-
-def _leave_interrupts_to_the_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def warm_up(wanted: Sequence[Case], say: Callable[[str], None]) -> None:
@@ -106,15 +64,17 @@ def drive_all(
     drive: Callable[[Case], Result] = cases.result,
 ) -> list[Result]:
     """Results of the cases, in their order; driven longest first, for the cores to finish together."""
-    order = sorted(range(len(wanted)), key=lambda index: -effort(wanted[index]))
+    seconds = [seconds_of(case) for case in wanted]
+    order = sorted(range(len(wanted)), key=lambda index: -seconds[index])
+    jobs = min(jobs, round(sum(seconds) / _WORTH_A_PROCESS_S))
     made = on_all_cores(drive, [wanted[index] for index in order], jobs, done)
     return [result for _, result in sorted(zip(order, made, strict=True), key=lambda pair: pair[0])]
 
 
-def effort(case: Case) -> float:
-    """How long a case takes beside others: plant steps, times what its strategy takes beside equal split."""
+def seconds_of(case: Case) -> float:
+    """About how long a processor needs for a case: plant steps, times what its strategy takes beside equal split."""
     steps = _duration_s(case.cycle) / case.dt_s * case.substeps
-    return steps * _WEIGHTS.get(case.strategy, _OTHER_WEIGHT)
+    return _SECONDS_PER_STEP * steps * _WEIGHTS.get(case.strategy, _OTHER_WEIGHT)
 
 
 @functools.cache
@@ -123,9 +83,9 @@ def _duration_s(cycle: str) -> float:
     return cases.cycle_of(cycle).duration_s
 
 
-def progress_of(total: int, unit: str, quiet: bool) -> tqdm[Any]:
+def progress_of(total: int, unit: str, quiet: bool, name: str = "") -> tqdm[Any]:
     """A bar on stderr that is gone when it is done."""
-    return tqdm(total=total, unit=unit, file=sys.stderr, disable=quiet, leave=False)
+    return tqdm(total=total, unit=unit, desc=name or None, file=sys.stderr, disable=quiet, leave=False)
 
 
 class Progress:

@@ -14,9 +14,9 @@ from iwm_power_manager.files import atomic_write
 from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.vehicle import Vehicle
+from iwm_sim.cluster import on_all_cores
 from iwm_sim.study import cases, labels, paper, skid
 from iwm_sim.study.cases import Case, Change, Rule, SensorNoise
-from iwm_sim.study.driving import on_all_cores
 from iwm_sim.study.policies import PolicySource, solved
 from iwm_sim.study.variants import VARIANTS
 

@@ -7,7 +7,7 @@ The result is a `Study` (stored as `study.json`), from which `pages` makes table
 from __future__ import annotations
 
 import functools
-import sys
+import operator
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
 
 from iwm_power_manager import __version__
 from iwm_power_manager.control.settings import as_shown, default_settings
@@ -25,10 +24,11 @@ from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.policy import Policy
 from iwm_power_manager.vehicle import pack_energy_wh
+from iwm_sim.cluster import on_all_cores
 from iwm_sim.study import ablation, battery_fit, cases, criteria, labels, pages, paper, sensitivity, skid
 from iwm_sim.study.cases import Case, Result
 from iwm_sim.study.content import PolicyIdentity, Robustness, Study, frontier_of
-from iwm_sim.study.driving import on_all_cores, silent, tell, warm_up
+from iwm_sim.study.driving import progress_of, silent, tell, warm_up
 from iwm_sim.study.plan import IDLE_DRIVES, STRATEGY, Plan, Policies, among, fitted_rules, keys, stops, whole
 from iwm_sim.study.rows import Row, rows_of
 from iwm_sim.study.study_figures import Material, convergence_of, drawn, window_of
@@ -72,7 +72,7 @@ def study(
             policies.of_variant(name, *key)
     priced = policies.priced(output / "grids")
     warm_up(_warming(policies, cycles[0]), say)
-    with tqdm(total=1, unit="run", file=sys.stderr, disable=quiet, leave=False) as bar:
+    with progress_of(1, "run", quiet) as bar:
         rules = fitted_rules(vehicle, keys(), jobs)
         plan = whole(policies, cycles, rules, priced)
         tasks: list[Callable[[], Any]] = [functools.partial(cases.result, case) for case in plan.cases]
@@ -80,7 +80,7 @@ def study(
         tasks += [functools.partial(_all_stops, stops(policies))]
         bar.total = len(tasks)
         bar.refresh()
-        made = on_all_cores(_call, tasks, jobs, lambda _: _tick(bar))
+        made = on_all_cores(operator.call, tasks, jobs, lambda _: bar.update())
     places = tuple((among(cycle, cycles), friction) for cycle, friction in ablation.PLACES)
     ablated = ablation.ablation(policies, output / "grids", jobs, say, tuple(dict.fromkeys(places)))
     stored = _study(policies, plan, made[:-2], made[-2], made[-1], ablated).to_json()
@@ -101,14 +101,6 @@ def study(
         atomic_write(document.with_suffix(".json"), stored)
     say(f"{len(tasks)} runs in {time.perf_counter() - started:.0f} s: {output / 'study.html'}")
     return content
-
-
-def _tick(bar: Any) -> None:
-    bar.update()
-
-
-def _call(task: Callable[[], Any]) -> Any:
-    return task()
 
 
 def _all_stops(wanted: Sequence[skid.Stop]) -> list[skid.Stopped]:

@@ -19,12 +19,13 @@ from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.feasible import trace_warnings
 from iwm_power_manager.tools.command import PICTURES, write_json, write_picture
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
+from iwm_sim.cluster import on_all_cores
 from iwm_sim.road_report import text as road_text
 from iwm_sim.road_run import check_scenario
 from iwm_sim.scenario import load_scenario
 from iwm_sim.study import ablation, battery_fit, cases, frontier, frontier_figure, paper, reproduce, single, unseen
 from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result, SensorNoise
-from iwm_sim.study.driving import Progress, drive_all, on_all_cores, progress_of, silent, tell, warm_up, with_rules
+from iwm_sim.study.driving import Progress, drive_all, progress_of, silent, tell, warm_up, with_rules
 from iwm_sim.study.names import REFERENCE
 from iwm_sim.study.plan import Policies
 from iwm_sim.study.policies import PolicySource

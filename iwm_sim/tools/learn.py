@@ -15,8 +15,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from iwm_power_manager import __version__
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import ConfigError
@@ -46,6 +44,7 @@ from iwm_sim.learning import (
     learn,
     recorded_cycle,
 )
+from iwm_sim.study.driving import progress_of
 from iwm_sim.study.names import cores
 
 _DESCRIPTION = """\
@@ -173,14 +172,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _tried(task: Task, candidates: Sequence[Candidate], jobs: int, quiet: bool) -> Learned:
     """Try candidates with a bar, and say after the first how long all of them will take."""
-    with tqdm(
-        total=len(candidates),
-        desc=f"friction {task.friction:g}",
-        unit="policy",
-        file=sys.stderr,
-        disable=quiet,
-        leave=False,
-    ) as bar:
+    with progress_of(len(candidates), "policy", quiet, f"friction {task.friction:g}") as bar:
         return learn(task, candidates, jobs, _announcing(bar, len(candidates), jobs))
 
 

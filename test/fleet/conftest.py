@@ -6,8 +6,9 @@ from collections.abc import Iterator
 import pytest
 from distributed import Client
 
+from iwm_sim.cluster import connected
 from iwm_sim.fleet.plan import Plan, plan_of
-from iwm_sim.fleet.run import connected, runner
+from iwm_sim.fleet.run import runner
 from iwm_sim.fleet.store import Store
 from iwm_sim.fleet.task import Drive
 from study_fixtures import hill, small_grid

@@ -9,7 +9,8 @@ import sys
 import pytest
 
 from iwm_power_manager.errors import ConfigError, IwmError
-from iwm_sim.fleet.run import Runner, batched, connected, runner
+from iwm_sim.cluster import connected
+from iwm_sim.fleet.run import Runner, batched, runner
 from iwm_sim.fleet.store import Store
 from iwm_sim.fleet.task import Drive, fingerprint
 
@@ -65,7 +66,7 @@ def test_a_worker_whose_mathematics_gives_other_bits_is_refused(client, fleet, s
 
 
 def test_an_address_where_nobody_answers_is_named(monkeypatch, fleet, tmp_path):
-    monkeypatch.setattr("iwm_sim.fleet.run.ANSWER_S", 0.5)
+    monkeypatch.setattr("iwm_sim.cluster.ANSWER_S", 0.5)
     with pytest.raises(ConfigError, match=r"--scheduler: tcp://127\.0\.0\.1:1"), connected("tcp://127.0.0.1:1", 1):
         pass
     with pytest.raises(ConfigError, match="--scheduler: nowhere"), connected("nowhere://x", 1):

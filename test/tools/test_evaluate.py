@@ -216,10 +216,10 @@ def test_a_value_out_of_range_is_refused_with_its_range(arguments, capsys):
     assert "allowed" in error or "choose from" in error
 
 
-def test_the_command_runs_as_a_process_on_all_cores(hill, tmp_path):
+def test_the_command_runs_as_a_process(hill, tmp_path):
     out = tmp_path / "out.json"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "iwm_sim.tools.evaluate", "--cycle", str(hill), "--json", str(out), "--jobs", "2"]
+    command = [sys.executable, "-m", "iwm_sim.tools.evaluate", "--cycle", str(hill), "--json", str(out)]
     made = subprocess.run(
         [*command, "--strategy", "equal", "instantaneous"], env=environment, capture_output=True, text=True, check=False
     )
