@@ -40,7 +40,7 @@ MAX_NUMBER_LENGTH = 40
 MAX_LINE_LENGTH = 4096
 
 _BLOCK = 2**20
-_NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?", re.ASCII)
+_NUMBER = re.compile(r"[-+]?(?!0[0-9]+$)([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?", re.ASCII)
 _BARE_INDEX = re.compile(r"[^\W\d]\w*\[\d+\](?![\w.]*[\"'])")
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 
@@ -74,8 +74,11 @@ def read_bytes(path: Path | str, limit: int = MAX_FILE_BYTES) -> bytes:
 
 def read_text(path: Path | str, limit: int = MAX_TEXT_BYTES) -> str:
     """All text of a UTF-8 file (a byte order mark is skipped); anything else is a `ConfigError`."""
+    content = read_bytes(path, limit)
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff") or 0 in content[:2]:
+        raise ConfigError(path, "", "is not UTF-8 text: looks like UTF-16; save it as UTF-8")
     try:
-        return read_bytes(path, limit).decode("utf-8-sig")
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(path, "", f"is not UTF-8 text (byte {error.start})") from None
 
@@ -91,7 +94,7 @@ def sha256_of(path: Path | str) -> str:
 def content_sha256(path: Path | str) -> str:
     """SHA-256 of a file's bytes; of a folder, over the names and hashes of the files in it."""
     path = Path(path)
-    if not path.is_dir():
+    if not os.path.isdir(path):
         return sha256_of(path)
     files = sorted(file for file in path.iterdir() if file.is_file())
     return hashlib.sha256("".join(f"{file.name} {sha256_of(file)}\n" for file in files).encode()).hexdigest()
@@ -284,7 +287,9 @@ def _hint(text: str) -> str:
         return ": its sign is a dash; write -"
     if any(c.isdigit() and not c.isascii() for c in text):
         return ": write the digits 0 to 9"
-    if re.fullmatch(r"[-+]?[0-9]{1,3}([ '\u00a0\u202f_][0-9]+)+([.,][0-9]+)?", text):
+    if re.fullmatch(r"[-+]?0[0-9xXoObB].*", text):
+        return ": write it in decimal digits, without leading zeros"
+    if re.fullmatch(r"[-+]?[0-9]{1,3}([ '\u00a0\u2009\u202f_][0-9]+)+([.,][0-9]+)?", text):
         return ": write it without separators"
     if re.match(r"[-+]?[0-9.]+\s*[^\W\d_]", text):
         return ": write it without a unit"

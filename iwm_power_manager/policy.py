@@ -27,6 +27,7 @@ import hashlib
 import io
 import json
 import math
+import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -431,12 +432,12 @@ def load_policy_bank(path: Path | str, vehicle: Vehicle | None = None) -> list[P
         There is none, one is bad, two are for the same friction, or they are for different cars.
     """
     path = Path(path)
-    files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+    files = sorted(path.glob("*.npz")) if os.path.isdir(path) else [path]
     if not files:
         raise PolicyError(f"{path}: holds no policy file (*.npz)")
     loaded = [(file, load_policy(file)) for file in files]
     if vehicle is not None:
-        if not path.is_dir():
+        if not os.path.isdir(path):
             loaded[0][1].check_vehicle(vehicle, str(path))
         loaded = [(file, policy) for file, policy in loaded if policy.vehicle_hash == vehicle.hash]
         if not loaded:

@@ -41,7 +41,7 @@ def share_path(relative: Path | str) -> Path:
         If the package was installed without it.
     """
     for root in roots():
-        if (root / relative).exists():
+        if os.path.exists(root / relative):
             return root / relative
     searched = ", ".join(map(str, roots())) or "no folder"
     raise ConfigError(relative, "", f"no such file in the package; searched {searched}")
@@ -60,19 +60,21 @@ def resolve(path: Path | str) -> Path:
     ConfigError
         If a name alone fits several files of the package, or none but is much like some.
     """
-    given = Path(path).expanduser()
-    if given.is_absolute() or (given.exists() and not given.is_dir()):
+    given = Path(os.path.expanduser(path))
+    # Path's own exists() and is_dir() raise for a name that is too long or lies in a folder that may not be entered.
+    there = os.path.exists(given)
+    if given.is_absolute() or (there and not os.path.isdir(given)):
         return given
     for root in roots():
-        if (root / given).exists() and not given.exists():
+        if os.path.exists(root / given) and not there:
             return root / given
         matches = _files_named(root, str(given)) if len(given.parts) == 1 else []
-        if len(matches) > 1 and not given.exists():
+        if len(matches) > 1 and not there:
             names = ", ".join(str(match.relative_to(root)) for match in matches)
             raise ConfigError(given, "", "fits several files of the package", names)
         if len(matches) == 1:
             return matches[0]
-    if given.exists():
+    if there:
         return given
     known = {path.name for root in roots() for path in _files(root)} if len(given.parts) == 1 else set()
     near = did_you_mean(given, known)
@@ -86,6 +88,7 @@ def did_you_mean(given: Path, known: Iterable[str] = ()) -> str:
     names = set(known)
     with contextlib.suppress(OSError):
         names |= {path.name for path in given.parent.iterdir()}
+    names.discard(given.name)  # there, but a link to nowhere
     by_stem = {Path(name).stem: name for name in sorted(names)}
     near = errors.spelled_like(given.stem, by_stem)
     return errors.did_you_mean(str(given.with_name(by_stem[stem] if given.suffix else stem)) for stem in near)

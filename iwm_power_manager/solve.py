@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
 import time
 from collections.abc import Callable, Sequence
@@ -47,7 +48,7 @@ def load_grid(name: str, vehicle: VehicleParams) -> Problem:
 def grid_path(name: str) -> Path:
     """File of a grid: a preset by name, or the file itself."""
     preset = resolve(f"config/grids/{name}.yaml")
-    return preset if preset.exists() else resolve(name)
+    return preset if os.path.exists(preset) else resolve(name)
 
 
 def targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequence[float]) -> list[Path]:
@@ -59,7 +60,7 @@ def targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequenc
             raise ConfigError(
                 "arguments", "--output", f"{output} is one file for {len(frictions)} policies", "a folder"
             )
-        if not output.parent.is_dir():  # said before, not after the work
+        if not os.path.isdir(output.parent):  # said before, not after the work
             raise ConfigError("arguments", "--output", f"{output}: cannot be written: no such folder")
         return [output]
     try:

@@ -16,6 +16,7 @@ raises an `iwm_power_manager.errors.IwmError`, whose text is one line.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -99,7 +100,7 @@ def load_car(name: str, idle_drive: str | None = None) -> Vehicle:
 def load_bank(path: str, car: Vehicle) -> Bank:
     """Policies of a folder that belong to a car, or a single policy file."""
     found = resolve(path)
-    if found.is_file():
+    if os.path.isfile(found):
         policy = load_policy(found)
         policy.check_vehicle(car, path)
         return Bank((policy,))

@@ -269,7 +269,7 @@ def check_bag(plan: Plan, driven: Run, notes: dict[str, Any], path: Path) -> Out
 def _policy_file(plan: Plan) -> dict[str, str]:
     """The policy whose hash belongs into the bag, where it is one file."""
     path = resolve(plan.policy)
-    return {"policy_file": str(path.absolute())} if path.is_file() else {}
+    return {"policy_file": str(path.absolute())} if os.path.isfile(path) else {}
 
 
 def _absolute(path: str) -> str:

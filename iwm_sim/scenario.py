@@ -32,6 +32,7 @@ Between two places of a list friction jumps and grade is constant.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -215,7 +216,7 @@ def _file(path: Path, key: str, name: Any) -> Path:
     if not isinstance(name, str):
         raise ConfigError(path, key, f"{name!r} is no file name", "a file, or the name of one of the package")
     beside = path.parent / name
-    return beside if beside.is_file() else resolve(name)
+    return beside if os.path.isfile(beside) else resolve(name)
 
 
 def _loaded(vehicle: VehicleParams, load_kg: float) -> VehicleParams:

@@ -72,7 +72,7 @@ def test_windows_line_ends_and_a_byte_order_mark_are_read(write):
         ("time_s,speed_mps\n0,1\n1,fast\n", "line 3, speed_mps: 'fast' is no number"),
         ("time_s,speed_mps\n0,1\n1,nan\n", "line 3: speed_mps nan is not finite"),
         ("time_s,speed_mps\n0,1\ninf,1\n", "line 3: time_s inf is not finite"),
-        ("time_s,speed_mps\n0,1\n1,-0.1\n", "line 3: speed_mps -0.1 is out of range; allowed: 0 to 70"),
+        ("time_s,speed_mps\n0,1\n1,-0.5\n", "line 3: speed_mps -0.5 is out of range; allowed: 0 to 70"),
         ("time_s,speed_mps\n0,0\n1_0,1_2\n", "line 3, time_s: '1_0' is no number: write it without separators"),
         ("time_s,speed_mps\n0,0\n\u0661,1\n", "line 3, time_s: '\u0661' is no number: write the digits 0 to 9"),
         ("time_s,speed_mps\n0,0\n1,\u22125\n", "speed_mps: '\u22125' is no number: its sign is a dash; write -"),
@@ -88,6 +88,9 @@ def test_windows_line_ends_and_a_byte_order_mark_are_read(write):
         ("time_s,speed_mps\n# pause\n0,1\n2,1\n\n2,1\n", "line 6: time_s 2 does not increase; allowed: > 2 s"),
         ("time_s,speed_mps\n5,1\n2,1\n", "line 3: time_s 2 does not increase"),
         (b"time_s,speed_mps\n0,\xff\n", "is not UTF-8 text"),
+        ("time_s,speed_mps\n0,1\n1,1\n".encode("utf-16"), "looks like UTF-16; save it as UTF-8"),
+        ("time_s,speed_mps\n0,1\n1,1\n".encode("utf-16-le"), "looks like UTF-16; save it as UTF-8"),
+        ("time_s,speed_mps\n0,1\n017,1\n", "line 3, time_s: '017' is no number: write it in decimal digits"),
         ('time_s,speed_mps\n0,"1\n1,1\n', "line 2: is no table"),
     ],
 )
@@ -192,6 +195,8 @@ def test_hard_driving_slow_driving_and_noise_are_no_mistake(write):
 def test_noise_of_a_sensor_at_rest_is_rest(write):
     assert load_cycle(write("time_s,speed_mps\n0,-0.001\n1,1\n")).speed_mps.tolist() == [0.0, 1.0]
     assert make_cycle("made", [0, 1], [-0.05, 1.0]).speed_mps.tolist() == [0.0, 1.0]
+    at_rest = np.random.default_rng(4).normal(0.0, 0.2 / 3.6, 2000)
+    assert make_cycle("made", np.arange(2000.0), at_rest).speed_mps.min() == 0.0
 
 
 @pytest.mark.parametrize("end", ["1.7e9", "1e12", "100002"])

@@ -244,7 +244,9 @@ def test_numbers_of_yaml_keep_their_kind(tmp_path, text, value):
     assert (found, type(found)) == (value, type(value))
 
 
-@pytest.mark.parametrize("text", ["1", "-1.5", " .5 ", "+2.", "1e-3", "1E5", "nan", "-inf", "Infinity"])
+@pytest.mark.parametrize(
+    "text", ["1", "-1.5", " .5 ", "+2.", "0", "-0.0", "00.5", "1e-3", "1E5", "nan", "-inf", "Infinity"]
+)
 def test_numbers_of_a_table_are_read(text):
     assert repr(files.to_number(text)) == repr(float(text))
 
@@ -260,7 +262,9 @@ def test_numbers_of_a_table_are_read(text):
         ("\u22125", "its sign is a dash; write -"),
         ("\u0661\u0660", "write the digits 0 to 9"),
         ("50 km/h", "write it without a unit"),
-        ("0x10", "is no number"),
+        ("0x10", "write it in decimal digits, without leading zeros"),
+        ("-017", "write it in decimal digits, without leading zeros"),
+        ("1\u2009000", "write it without separators"),
         ("1" * 41, "it has 41 characters, more than 40"),
     ],
 )

@@ -95,6 +95,19 @@ def test_the_files_of_an_installation_are_found_without_any_variable(
     assert share.roots()[0] == shared
 
 
+@pytest.mark.parametrize("name", ["x" * 300, "a\0b", "~nobody-at-all/car.yaml", "config/" + "x" * 300])
+def test_a_name_that_no_file_can_have_comes_back_for_whoever_opens_it(name: str) -> None:
+    assert share.resolve(name) == Path(name)
+    with pytest.raises(ConfigError, match="cannot be read: "):
+        read_bytes(share.resolve(name))
+
+
+def test_a_link_to_nowhere_is_not_answered_with_its_own_name(tmp_path: Path) -> None:
+    (tmp_path / "my_van.yaml").symlink_to("nowhere")
+    with pytest.raises(ConfigError, match=r"No such file or directory$"):
+        read_bytes(tmp_path / "my_van.yaml")
+
+
 def test_a_file_that_is_not_there_is_answered_with_its_neighbours_of_nearly_that_name(tmp_path: Path) -> None:
     (tmp_path / "my_van.yaml").touch()
     with pytest.raises(ConfigError, match=rf"No such file or directory; did you mean {tmp_path}/my_van\.yaml\?$"):

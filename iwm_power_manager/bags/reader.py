@@ -151,9 +151,9 @@ class BagReader:
 
     def _information(self) -> dict[str, Any]:
         path = self.path / METADATA_FILE
-        if not self.path.is_dir():
+        if not os.path.isdir(self.path):
             return {}
-        if not path.exists():
+        if not os.path.lexists(path):
             self._damage.append(f"{self.path}: has no metadata.yaml: the recorder did not finish")
             return {}
         try:
@@ -182,7 +182,7 @@ class BagReader:
         self._damage += problems
 
     def _file_names(self) -> list[Path]:
-        if not self.path.is_dir():
+        if not os.path.isdir(self.path):
             return [self.path]
         # Older versions put the folder's name in front; what leads elsewhere is looked for here, and is not.
         content = self.information.get("relative_file_paths")
@@ -225,7 +225,11 @@ def open_source(opened: Path, path: Path, stack: ExitStack) -> Source:
 
 def data_files(folder: Path) -> list[Path]:
     """Data files of a bag's folder in the order of recording: `bag_10.mcap` comes after `bag_9.mcap`."""
-    names = [entry for entry in folder.iterdir() if entry.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES)]
+    try:
+        entries = list(folder.iterdir())
+    except OSError as error:
+        raise BagError(f"{folder}: cannot be read: {error.strerror or error}") from None
+    names = [entry for entry in entries if entry.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES)]
     return sorted(names, key=_recording_order)
 
 

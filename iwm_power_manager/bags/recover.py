@@ -137,7 +137,7 @@ def recover(path: Path | str) -> Recovery:
         There is no such bag, nothing in it can be read, or there is no room for the rebuilt file.
     """
     path = Path(path)
-    folder = path if path.is_dir() else None
+    folder = path if os.path.isdir(path) else None
     with ExitStack() as stack:
         files: list[_File] = []
         left_out: list[FileRecovery] = []
@@ -174,7 +174,7 @@ def _names(path: Path) -> list[Path]:
     """Data files; not those of which an earlier recovery has left its result beside them."""
     if not os.path.exists(path):
         raise BagError(f"{path}: does not exist{did_you_mean(path)}")
-    if not path.is_dir():
+    if not os.path.isdir(path):
         if not path.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES):
             raise BagError(f"{path}: is no folder and no .mcap or .db3 file")
         return [path]

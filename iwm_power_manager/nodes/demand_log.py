@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -45,10 +46,10 @@ class DemandLog:
         if table.power_w.size < 2:
             grid = load_problem(share_path("config/grids/coupled.yaml")).for_car(vehicle)
             axes = grid.power_w, grid.speed_mps, grid.dt_s
-        before = load_transitions(path) if path.exists() else None
+        before = load_transitions(path) if os.path.exists(path) else None
         if before is not None and not before.fits(*axes):
             raise ConfigError(path, "", "was counted on the axes of another policy; choose another file")
-        if not path.parent.is_dir():
+        if not os.path.isdir(path.parent):
             raise ConfigError(path, "", "is in a folder that does not exist")
         self._counter = DemandCounter(*axes, before)
         self._written_s = time.monotonic()

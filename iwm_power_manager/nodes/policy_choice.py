@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from iwm_power_manager.control.strategies import STRATEGIES
@@ -124,7 +125,7 @@ def _load(path: str, vehicle: Vehicle) -> tuple[list[Policy], dict[Path, int]]:
         raise PolicyError("policy_file: is empty; allowed: a policy file, or a folder of them")
     resolved = resolve(path)
     bank = load_policy_bank(resolved, vehicle)
-    files = sorted(resolved.glob("*.npz")) if resolved.is_dir() else [resolved]
+    files = sorted(resolved.glob("*.npz")) if os.path.isdir(resolved) else [resolved]
     return bank, {file: _modified_ns(file) for file in files}
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -145,7 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _solve(options: argparse.Namespace) -> int:
     """Solve; a folder that was made for policies that did not come is taken away again."""
     folder = Path(options.output or ".")
-    there = folder.exists()
+    there = os.path.exists(folder)
     try:
         return _solve_into(options)
     except BaseException:

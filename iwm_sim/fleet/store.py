@@ -13,6 +13,7 @@ would stand beside each other as if they could be compared.
 from __future__ import annotations
 
 import json
+import os
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -65,7 +66,7 @@ class Store:
         """
         path = self.folder / "fleet.json"
         hashes = {name: sha256_of(resolve(name)) for name in files}
-        begun = self.begun() if path.exists() else {"fingerprint": dict(fingerprint), "files": {}}
+        begun = self.begun() if os.path.exists(path) else {"fingerprint": dict(fingerprint), "files": {}}
         problem = differences(begun["fingerprint"], fingerprint)
         changed = [name for name in files if begun["files"].get(name, hashes[name]) != hashes[name]]
         problem = problem or ", ".join(f"{name} was another file" for name in changed)

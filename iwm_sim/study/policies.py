@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -57,7 +58,7 @@ class PolicySource:
         PolicyError, ConfigError
         """
         bank = self._load()
-        if self._path.is_file():
+        if os.path.isfile(self._path):
             ((file, policy),) = bank.items()
             policy.check_vehicle(vehicle, file)
             if not self._is_on_grid(policy):
@@ -82,9 +83,9 @@ class PolicySource:
 
     def _load(self) -> dict[str, Policy]:
         if self._bank is None:
-            if self._path.is_dir():
+            if os.path.isdir(self._path):
                 files = sorted(self._path.rglob("*.npz"))
-            elif self._path.is_file() or self._path.suffix == ".npz":
+            elif os.path.isfile(self._path) or self._path.suffix == ".npz":
                 files = [self._path]
             else:
                 raise PolicyError(f"{self._given}: is neither a policy file nor a folder")
