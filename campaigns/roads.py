@@ -14,7 +14,7 @@ from pathlib import Path
 
 from campaigns.road_page import page, unknown
 from campaigns.unknown_friction import all_cells, all_jumped, differs, savings
-from iwm_power_manager.command_line import CommandParser
+from iwm_power_manager.command_line import CommandParser, refuse_without_effect
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.exit_codes import DONE, FAILED
@@ -47,6 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _drive(options: argparse.Namespace) -> int:
+    refuse_without_effect(options, {"--policy": (options.unknown, "it is for --unknown")})
     names = options.scenario or sorted(str(path) for path in share_path(FOLDER).glob("*.yaml"))
     scenarios = [load_scenario(name) for name in names]
     settings = default_settings(options.strategy)

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
-from iwm_power_manager.errors import did_you_mean, spelled_like
+from iwm_power_manager.errors import ConfigError, did_you_mean, spelled_like
 from iwm_power_manager.exit_codes import BAD_INPUT
 
 #: What argparse says of a value that is none of the choices.
@@ -15,14 +17,50 @@ _CHOICE = re.compile(r"invalid choice: '(?P<given>[^']*)' \(choose from (?P<know
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser whose description and examples stand as typed, and which does not repeat its usage at an error."""
+    """A parser whose description and examples stand as typed, and which does not repeat its usage at an error.
+
+    Options are written in full, so that `given` of what it has parsed holds the names of those that were given;
+    `--no-x`, the other side of `--x`, is `--x` there.
+    """
 
     def __init__(self, prog: str, **settings: Any) -> None:
         settings.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
-        super().__init__(prog, **settings)
+        super().__init__(prog, allow_abbrev=False, **settings)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse what is known; where anything else is left, say what may have been meant."""
+        words = sys.argv[1:] if args is None else list(args)
+        found, unknown = super().parse_known_args(words, namespace)
+        options = re.findall(r"--[a-z][\w-]*", self.format_usage())
+        if unknown:
+            near = [name for word in unknown for name in spelled_like(word.partition("=")[0], options)[:1]]
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{did_you_mean(near)}")
+        names = (word.partition("=")[0] for word in words if word.startswith("--"))
+        found.given = {positive if (positive := f"--{name[5:]}") in options else name for name in names}
+        return found, unknown
+
+    def check(self, options: argparse.Namespace, useful: Mapping[str, tuple[object, str]]) -> None:
+        """`refuse_without_effect`, as a mistake in the command line."""
+        try:
+            refuse_without_effect(options, useful)
+        except ConfigError as error:
+            self.error(str(error))
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and where help is."""
         if choice := _CHOICE.search(message):
             message += did_you_mean(spelled_like(choice["given"], re.findall("'([^']*)'", choice["known"])))
         self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def refuse_without_effect(options: argparse.Namespace, useful: Mapping[str, tuple[object, str]]) -> None:
+    """Refuse an option that was given and would change nothing; `ConfigError`.
+
+    Parameters
+    ----------
+    options : as a `CommandParser` gave them
+    useful : whether an option changes anything beside the others, and if not, why
+    """
+    for option, (has_effect, reason) in useful.items():
+        if option in options.given and not has_effect:
+            raise ConfigError("arguments", option, f"has no effect: {reason}")

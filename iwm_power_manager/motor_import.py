@@ -59,6 +59,8 @@ def read_points(
     if guessed:
         layout = "list" if len(table.rows[-1][1]) == 3 else "matrix"
         said.append(f"layout {layout}: it has {len(table.rows[-1][1])} columns")
+    if layout == "list" and down != "speed":
+        raise ConfigError("arguments", "--down", f"has no effect: {path} is read as a list", "--layout matrix with it")
     header = " ".join(table.rows[0][1])
     named = next((unit for unit, names in _SPEED_NAMES.items() if re.search(names, header, re.IGNORECASE)), "")
     doubts = []

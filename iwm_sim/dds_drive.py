@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from iwm_power_manager import files
 from iwm_power_manager.control.settings import Settings
@@ -28,6 +27,7 @@ from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.nodes import power_manager_config
 from iwm_power_manager.nodes.policy_choice import choose_policies
 from iwm_power_manager.share import resolve
+from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 from iwm_sim import closed_loop
 from iwm_sim.closed_loop import Run
@@ -282,7 +282,7 @@ def follow(simulator: Child, others: Sequence[Child], name: str) -> None:
     assert stream is not None
     os.set_blocking(stream.fileno(), False)
     pending = b""
-    bar: Any = None
+    bar: Bar | None = None
     try:
         while simulator.running:
             for child in others:
@@ -301,14 +301,9 @@ def follow(simulator: Child, others: Sequence[Child], name: str) -> None:
     simulator.check()
 
 
-def _bar(name: str, whole_s: float) -> Any:
-    return tqdm(
-        desc=f"driving {name}",
-        total=whole_s,
-        bar_format="{desc} {percentage:3.0f}% |{bar}| {n:.0f} of {total:.0f} s, {elapsed} so far, {remaining} to go",
-        mininterval=0.1 if sys.stderr.isatty() else 10.0,
-        leave=False,
-    )
+def _bar(name: str, whole_s: float) -> Bar:
+    style = "{desc} {percentage:3.0f}% |{bar}| {n:.0f} of {total:.0f} s, {elapsed} so far, {remaining} to go"
+    return Bar(whole_s, "s", f"driving {name}", bar_format=style)
 
 
 def _progress(lines: Sequence[bytes]) -> Iterator[tuple[float, float]]:

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is wrong with a command line is one line."""
 
+from argparse import BooleanOptionalAction
+
 import pytest
 
-from iwm_power_manager.command_line import CommandParser
+from iwm_power_manager.command_line import CommandParser, refuse_without_effect
+from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.tools.command import picture
 
 
@@ -11,6 +14,8 @@ from iwm_power_manager.tools.command import picture
 def parser():
     made = CommandParser("draw", description="Draws.\n\n  as typed")
     made.add_argument("--plot", type=picture)
+    made.add_argument("--record", action=BooleanOptionalAction)
+    made.add_argument("--no-page", action="store_true")
     made.add_argument("--strategy", choices=["sdp", "sdp_lookahead", "equal"])
     made.add_subparsers(dest="what").add_parser("all").add_argument("--many", type=int)
     return made
@@ -21,6 +26,9 @@ def parser():
     [
         (["--no-such"], "unrecognized arguments: --no-such", "draw"),
         (["--plot", "a.txt"], "a.txt is no picture's name; allowed: ending in .pdf, .png, .svg", "draw"),
+        (["--plt", "all"], "unrecognized arguments: --plt; did you mean --plot?", "draw"),
+        (["--plo=a.png"], "unrecognized arguments: --plo=a.png; did you mean --plot?", "draw"),
+        (["all", "--mny", "3"], "unrecognized arguments: --mny 3; did you mean --many?", "draw all"),
         (["--strategy", "sdp_lookahed"], "'sdp_lookahead', 'equal'); did you mean sdp_lookahead?", "draw"),
         (["--strategy", "magic"], "'magic' (choose from 'sdp', 'sdp_lookahead', 'equal') (see", "draw"),
         (["al"], "did you mean all?", "draw"),
@@ -41,3 +49,18 @@ def test_help_stands_as_typed(parser, capsys):
     with pytest.raises(SystemExit):
         parser.parse_args(["--help"])
     assert "Draws.\n\n  as typed" in capsys.readouterr().out
+
+
+def test_the_options_that_were_given_are_known_by_name(parser):
+    given = parser.parse_args(["--plot=a.png", "--no-record", "--no-page", "all", "--many", "3"]).given
+    assert given == {"--plot", "--record", "--no-page", "--many"}
+
+
+def test_an_option_without_effect_is_refused_only_where_it_was_given(parser, capsys):
+    useful = {"--record": (False, "nothing runs"), "--plot": (True, "it draws")}
+    refuse_without_effect(parser.parse_args(["--plot", "a.png"]), useful)
+    with pytest.raises(ConfigError, match="arguments: --record: has no effect: nothing runs"):
+        refuse_without_effect(parser.parse_args(["--no-record"]), useful)
+    with pytest.raises(SystemExit):
+        parser.check(parser.parse_args(["--record"]), useful)
+    assert "draw: error: arguments: --record: has no effect: nothing runs (see draw --help)" in capsys.readouterr().err

@@ -18,9 +18,9 @@ from iwm_power_manager.exit_codes import DONE, INTERRUPTED
 from iwm_power_manager.files import atomic_write
 
 
-def described(name: str, description: str, examples: str, *, abbreviated: bool = True) -> argparse.ArgumentParser:
-    """Parser of a command, with `--version` and examples as typed; whether options may be `abbreviated`."""
-    parser = CommandParser(name, description=description, epilog=examples, allow_abbrev=abbreviated)
+def described(name: str, description: str, examples: str) -> argparse.ArgumentParser:
+    """Parser of a command, with `--version` and examples as typed."""
+    parser = CommandParser(name, description=description, epilog=examples)
     parser.add_argument("--version", action="version", version=f"{name} {__version__}")
     return parser
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from iwm_power_manager import __version__
+from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.tables import SEPARATORS
 from iwm_power_manager.tools import command
@@ -105,6 +106,7 @@ def _import(options: argparse.Namespace) -> None:
     from iwm_power_manager.motor_map import fit_loss, map_of, mirrored, missing
     from iwm_power_manager.share import resolve
 
+    refuse_without_effect(options, {"--percent": (options.quantity == "efficiency", "--quantity loss is in W")})
     points = read_points(
         resolve(options.table),
         layout=options.layout,

@@ -17,11 +17,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from iwm_power_manager import __version__
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
+from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.control.strategies import drivable, name_of
 from iwm_power_manager.errors import BagError, ConfigError, IwmError, one_line
 from iwm_power_manager.exit_codes import CANNOT_TELL, DONE, FAILED
@@ -33,6 +32,7 @@ from iwm_power_manager.replay.what_if import Consumption, what_if
 from iwm_power_manager.signals.mapping import SignalMapping
 from iwm_power_manager.tools.command import described, ended
 from iwm_power_manager.tools.options import number, whole
+from iwm_power_manager.tools.progress import Bar
 
 _DESCRIPTION = """\
 Run the control law over a recorded drive, without DDS and without a clock: the same bag gives the same bytes every
@@ -117,6 +117,16 @@ def _check(options: argparse.Namespace) -> None:
         )
     if options.what_if is None and len(options.strategy or []) > 1:
         raise ConfigError("arguments", "--strategy", "several make sense with --what-if only")
+    only_then = "it is for --publish"
+    played = dict.fromkeys(
+        ("--rate", "--step", "--start", "--end", "--loop", "--listeners", "--topics"), (options.publish, only_then)
+    )
+    not_played = "--publish computes nothing"
+    computed = dict.fromkeys(
+        ("--vehicle", "--policy", "--strategy", "--friction", "--set", "--json", "--quiet"),
+        (not options.publish, not_played),
+    )
+    refuse_without_effect(options, played | computed | {"--tolerance": (options.compare, "it is for --compare")})
     if options.end is not None:
         check_number("arguments", "--end", options.end, options.start, above=True)
 
@@ -324,13 +334,10 @@ def _show(lines: list[str], result: dict[str, Any], options: argparse.Namespace)
 
 
 @contextmanager
-def _progress(bag: BagReader, options: argparse.Namespace, passes: int) -> Iterator[Callable[[int, int], None] | None]:
+def _progress(bag: BagReader, options: argparse.Namespace, passes: int) -> Iterator[Callable[[int, int], None]]:
     """Progress by the recorded time, because a damaged bag does not know its number of messages."""
-    if options.quiet or not sys.stderr.isatty():
-        yield None
-        return
     span_s = max((bag.end_ns - bag.start_ns) * 1e-9, 1e-9)
-    with tqdm(total=round(passes * span_s, 1), unit="s", desc=bag.path.name, leave=False) as bar:
+    with Bar(round(passes * span_s, 1), "s", bag.path.name, quiet=options.quiet) as bar:
         done_s = 0.0
         last = 0
 

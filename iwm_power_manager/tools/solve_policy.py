@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from iwm_power_manager import __version__
+from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import check_number
@@ -44,6 +44,7 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
 from iwm_power_manager.tools.command import described, ended, picture, write_json
 from iwm_power_manager.tools.options import several
+from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
 SOLVED, UNSOLVED = 0, 1
@@ -143,6 +144,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return ended("solve_policy", lambda: _check(options) if options.check else _solve(options))
 
 
+#: What --check takes beside the files.
+_OF_CHECK = {"--check", "--vehicle", "--idle-drive", "--quiet"}
+
+
 def _solve(options: argparse.Namespace) -> int:
     """Solve; a folder that was made for policies that did not come is taken away again."""
     folder = Path(options.output or ".")
@@ -204,6 +209,13 @@ def _demand_arguments(options: argparse.Namespace) -> None:
     if options.export_mdp and len(options.friction) > 1:
         raise ConfigError("arguments", "--export-mdp", "takes one problem", "one --friction")
     check_number("arguments", "--bag-weight", options.bag_weight, 0.0, 1e6, above=True)
+    refuse_without_effect(
+        options,
+        {
+            "--mapping": (options.bag, "it is for --bag"),
+            "--bag-weight": (options.bag or options.transitions, "it is for --bag and --transitions"),
+        },
+    )
 
 
 def _problem(options: argparse.Namespace, vehicle: Vehicle) -> Problem:
@@ -233,15 +245,8 @@ class _Progress:
     def __init__(self, label: str, tolerance_j: float, quiet: bool) -> None:
         self._tolerance = tolerance_j
         self._first = 0.0
-        self._bar = tqdm(
-            total=100,
-            desc=f"{label}: tabulating",
-            unit="%",
-            bar_format="{desc} |{bar}| {n_fmt}% [{elapsed}]{postfix}",
-            file=sys.stderr,
-            disable=quiet,
-            leave=False,
-        )
+        style = "{desc} |{bar}| {n_fmt}% [{elapsed}]{postfix}"
+        self._bar = Bar(100, "%", f"{label}: tabulating", quiet=quiet, bar_format=style)
         self._label = label
 
     def __enter__(self) -> _Progress:
@@ -263,6 +268,7 @@ class _Progress:
 
 def _check(options: argparse.Namespace) -> int:
     """Verify policy files against a car: identity, integrity, and the bound, computed anew."""
+    refuse_without_effect(options, {option: (option in _OF_CHECK, "not with --check") for option in options.given})
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
     kept = True
     for name in options.check:

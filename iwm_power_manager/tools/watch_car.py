@@ -405,6 +405,7 @@ def main(args: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if args is None else args)
     own = given[: given.index("--ros-args")] if "--ros-args" in given else given
     options = parser.parse_args(own)
+    parser.check(options, dict.fromkeys(("--port", "--no-browser"), (not options.terminal, "--terminal has no page")))
     if not options.terminal and importlib.util.find_spec("bokeh") is None:
         print("watch_car: needs the package bokeh (python3-bokeh-pip, or pip install bokeh)", file=sys.stderr)
         return FAILED

@@ -106,7 +106,7 @@ def ablation(
             replace(base, strategy=STRATEGY, label=labels.OURS, policy=policies.ours("none", friction)),
         ]
     with Progress(len(wanted), quiet) as progress:
-        by = by_place(rows_of(drive_all(wanted, jobs, progress.update)))
+        by = by_place(rows_of(drive_all(wanted, jobs, progress.done)))
     driven = {
         f"{cycle} {friction:g}": by[Place(cycle, friction, "none")]
         for cycle, friction in ((cases.cycle_of(path).name, friction) for path, friction in places)

@@ -12,6 +12,7 @@ from typing import Any
 from tqdm import tqdm
 
 from iwm_power_manager import kernel_cache
+from iwm_power_manager.tools.progress import Bar
 from iwm_sim.cluster import on_all_cores
 from iwm_sim.study import cases
 from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result
@@ -83,28 +84,17 @@ def _duration_s(cycle: str) -> float:
     return cases.cycle_of(cycle).duration_s
 
 
-def progress_of(total: int, unit: str, quiet: bool, name: str = "") -> tqdm[Any]:
-    """A bar on stderr that is gone when it is done."""
-    return tqdm(total=total, unit=unit, desc=name or None, file=sys.stderr, disable=quiet, leave=False)
-
-
-class Progress:
+class Progress(Bar):
     """A bar over cases."""
 
     def __init__(self, total: int, quiet: bool) -> None:
-        self._bar = progress_of(total, "case", quiet)
+        super().__init__(total, "cases", quiet=quiet)
 
-    def __enter__(self) -> Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def update(self, result: Result) -> None:
+    def done(self, result: Result) -> None:
         """One more is done."""
         case = result.case
-        self._bar.set_postfix_str(f"{cases.cycle_of(case.cycle).name} {case.friction:g} {case.name}")
-        self._bar.update()
+        self.set_postfix_str(f"{cases.cycle_of(case.cycle).name} {case.friction:g} {case.name}", refresh=False)
+        self.update()
 
 
 def tell(line: str) -> None:

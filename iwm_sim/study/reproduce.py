@@ -23,12 +23,13 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.policy import Policy
+from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import pack_energy_wh
 from iwm_sim.cluster import on_all_cores
 from iwm_sim.study import ablation, battery_fit, cases, criteria, labels, pages, paper, sensitivity, skid
 from iwm_sim.study.cases import Case, Result
 from iwm_sim.study.content import PolicyIdentity, Robustness, Study, frontier_of
-from iwm_sim.study.driving import progress_of, silent, tell, warm_up
+from iwm_sim.study.driving import silent, tell, warm_up
 from iwm_sim.study.plan import IDLE_DRIVES, STRATEGY, Plan, Policies, among, fitted_rules, keys, stops, whole
 from iwm_sim.study.rows import Row, rows_of
 from iwm_sim.study.study_figures import Material, convergence_of, drawn, window_of
@@ -72,7 +73,7 @@ def study(
             policies.of_variant(name, *key)
     priced = policies.priced(output / "grids")
     warm_up(_warming(policies, cycles[0]), say)
-    with progress_of(1, "run", quiet) as bar:
+    with Bar(1, "runs", quiet=quiet) as bar:
         rules = fitted_rules(vehicle, keys(), jobs)
         plan = whole(policies, cycles, rules, priced)
         tasks: list[Callable[[], Any]] = [functools.partial(cases.result, case) for case in plan.cases]

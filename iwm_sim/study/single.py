@@ -76,7 +76,7 @@ def paper_table(
             else:
                 wanted += [case for case in cell(base, policies, rules[key].coefficients) if case.label in _SHOWN]
     with Progress(len(wanted), quiet) as progress:
-        rows = rows_of(drive_all(wanted, jobs, progress.update))
+        rows = rows_of(drive_all(wanted, jobs, progress.done))
     names = [cases.cycle_of(cycle).name for cycle in cycles]
     tables = table_6(rows) if number == "6" else paper_tables(rows, names)
     return [table for table in tables if table.rows]

@@ -22,7 +22,7 @@ import numpy as np
 from iwm_power_manager import files, kernel_cache
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.settings import default_settings
-from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
+from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES, drivable
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.exit_codes import DONE, FAILED, INTERRUPTED
 from iwm_power_manager.model.parameters import IDLE_DRIVES
@@ -115,6 +115,11 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
     given = parser.parse_args(arguments)
     if given.animate and (given.scenario or given.animate.suffix != ".gif"):
         parser.error(f"--animate {given.animate}: draws a cycle's drive; allowed: a file that ends with .gif")
+    of_cycle = dict.fromkeys(
+        ("--cycle", "--vehicle", "--friction", "--soc"), (not given.scenario, "--scenario says it")
+    )
+    with_policy = (STRATEGIES[given.strategy].needs_policy, f"strategy {given.strategy} takes none")
+    parser.check(given, of_cycle | {"--policy": with_policy})
     return Plan(
         cycle=given.cycle,
         vehicle=given.vehicle,

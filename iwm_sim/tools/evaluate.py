@@ -10,13 +10,13 @@ import argparse
 import sys
 from collections.abc import Sequence
 
+from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES
-from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.tools.command import described, ended, picture
 from iwm_power_manager.tools.options import add_setting, number, several, whole
-from iwm_sim.study.names import DEFAULT_GRID, FIGURES, MAX_DT_S, REFERENCE, TABLES, cores
+from iwm_sim.study.names import DEFAULT_GRID, FIGURES, MAX_DT_S, NO_RESULTS, REFERENCE, TABLES, cores
 from iwm_sim.study.variants import VARIANTS
 
 DEFAULT_VEHICLE = "config/vehicles/jalalmaab_2015.yaml"
@@ -69,7 +69,7 @@ _COMMON = {"--vehicle", "--policy", "--jobs", "--quiet"}
 MODES = {
     "study": _COMMON | {"--study", "--update-doc"},
     "paper": _COMMON | {"--paper", "--cycle", "--idle-drive", "--json"},
-    "figure": _COMMON | {"--figure", "--plot"},
+    "figure": {"--figure", "--plot", "--vehicle", "--quiet"},
     "ablation": _COMMON | {"--ablation", "--json"},
     "frontier": {"--frontier", "--vehicle", "--idle-drive", "--cycle", "--friction", "--budgets"}
     | {"--json", "--quiet"},
@@ -82,7 +82,7 @@ MODES = {
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
-    result = described("evaluate", _DESCRIPTION, _EXAMPLES, abbreviated=False)
+    result = described("evaluate", _DESCRIPTION, _EXAMPLES)
     _add_cases(result.add_argument_group("cases (all combinations are driven)"))
     _add_policies(result.add_argument_group("policies (sdp, sdp_lookahead; preview takes its budget from them)"))
     _add_law(result.add_argument_group("control law"))
@@ -200,7 +200,9 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
 def _add_modes(parent: argparse._ArgumentGroup) -> None:
     group = parent.add_mutually_exclusive_group()
     group.add_argument("--paper", choices=list(TABLES), metavar="TABLE", help="a table of the paper: 3, 4, 5 or 6")
-    group.add_argument("--figure", choices=FIGURES, metavar="N", help=f"a figure of the study: {', '.join(FIGURES)}")
+    group.add_argument(
+        "--figure", type=_figure, choices=FIGURES, metavar="N", help=f"a figure of the study: {', '.join(FIGURES)}"
+    )
     group.add_argument(
         "--scenario", **several, metavar="NAME", help="real roads: files, or names of config/scenarios (see make roads)"
     )
@@ -227,17 +229,22 @@ def _add_modes(parent: argparse._ArgumentGroup) -> None:
     )
 
 
+def _figure(text: str) -> str:
+    if text in NO_RESULTS:
+        raise argparse.ArgumentTypeError(f"figure {text} is {NO_RESULTS[text]}; there is nothing to compute")
+    return text
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
     options.quiet |= options.json == "-"  # nothing else in what another program is to read
-    given = given_options(sys.argv[1:] if arguments is None else arguments)
-    return ended("evaluate", lambda: _evaluate(options, given))
+    return ended("evaluate", lambda: _evaluate(options))
 
 
-def _evaluate(options: argparse.Namespace, given: set[str]) -> None:
+def _evaluate(options: argparse.Namespace) -> None:
     mode = next((name for name in MODES if getattr(options, name)), "")
-    refuse_useless(options, given, mode)
+    refuse_without_effect(options, _useful_in(mode, options) if mode else _useful_in_cases(options))
     from iwm_sim.tools.evaluate_run import run
 
     run(mode, options)
@@ -246,41 +253,46 @@ def _evaluate(options: argparse.Namespace, given: set[str]) -> None:
 # --- options that would have no effect ------------------------------------------------------------------------------
 
 
-def given_options(arguments: Sequence[str]) -> set[str]:
-    """Names of the options that a command line has; `--no-x` counts as `--x`."""
-    names = {text.split("=", 1)[0] for text in arguments if text.startswith("--")}
-    return {"--gate-driving" if name == "--no-gate-driving" else name for name in names}
-
-
 _TABLES = f": {'; '.join(f'table {name} is of {", ".join(map(str, roads))}' for name, roads in TABLES.items())}"
 
+#: Strategies that decide alike on every road.
+_ON_ANY_ROAD = {REFERENCE, "instantaneous"}
 
-def refuse_useless(options: argparse.Namespace, given: set[str], mode: str) -> None:
-    """Refuse what would change nothing, instead of leaving it unsaid; `ConfigError`."""
-    if mode:
-        for option in sorted(given - MODES[mode]):
-            why = _TABLES if (mode, option) == ("paper", "--friction") else ""
-            raise ConfigError("arguments", option, f"has no effect with --{mode.replace('_', '-')}{why}")
-        return
+
+def _useful_in(mode: str, options: argparse.Namespace) -> dict[str, tuple[object, str]]:
+    """What changes anything of what is done instead of single cases."""
+    heeded = MODES[mode] | FIGURES.get(options.figure, frozenset())
+    what = f"not with --{mode.replace('_', '-')}{f' {options.figure}' if mode == 'figure' else ''}"
+    useful: dict[str, tuple[object, str]] = {option: (option in heeded, what) for option in sorted(options.given)}
+    if mode == "paper":
+        useful["--friction"] = (False, what + _TABLES)
+    return useful
+
+
+def _useful_in_cases(options: argparse.Namespace) -> dict[str, tuple[object, str]]:
+    """What changes anything of single cases, by their strategies."""
     strategies = set(options.strategy or [DEFAULT_STRATEGY])
     plain = strategies & set(STRATEGIES) - {REFERENCE}
-    with_policy = any(STRATEGIES[name].needs_policy for name in plain) or (
-        "preview" in plain and options.switching_cost is None
-    )
-    useful = {
-        "--policy": (with_policy, "no strategy here takes it"),
-        "--grid": (with_policy, "no strategy here takes it"),
-        "--decision-period": (bool(plain), "no strategy here takes it; those of the paper decide every 0.1 s"),
+    with_policy = {name for name in plain if STRATEGIES[name].needs_policy}
+    budgeted = "preview" in plain and options.switching_cost is None
+    told = with_policy if options.friction_source == "parameter" else set()
+    gated = options.gate_mode != law_settings.GATE_MODE_OFF
+    of_no_strategy = "no strategy here takes it"
+    return {
+        "--policy": (with_policy or budgeted, of_no_strategy),
+        **dict.fromkeys(("--grid", "--no-solve"), (told or budgeted, of_no_strategy)),
+        "--friction-source": (with_policy, of_no_strategy),
+        "--assumed-friction": (strategies - _ON_ANY_ROAD - with_policy | told, of_no_strategy),
+        "--decision-period": (plain, f"{of_no_strategy}; those of the paper decide every 0.1 s"),
         "--switching-power": ("instantaneous_slip" in plain, "it is for strategy instantaneous_slip"),
         "--switching-cost": ("preview" in plain, "it is for strategy preview"),
-        "--gate-driving": (options.gate_mode != law_settings.GATE_MODE_OFF, "--gate-mode off gates nothing"),
+        **dict.fromkeys(("--gate-driving", "--critical-slip"), (gated, "--gate-mode off gates nothing")),
         "--seed": (any(options.noise), "there is no --noise"),
         "--plot": (False, "it is for --figure and --fit-battery"),
         "--update-doc": (False, "it is for --study"),
+        "--budgets": (False, "it is for --frontier"),
+        **dict.fromkeys(("--seeds", "--cycles", "--cars"), (False, "it is for --unseen")),
     }
-    for option, (has_effect, reason) in useful.items():
-        if option in given and not has_effect:
-            raise ConfigError("arguments", option, f"has no effect: {reason}")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.feasible import trace_warnings
 from iwm_power_manager.tools.command import PICTURES, write_json, write_picture
+from iwm_power_manager.tools.progress import Bar
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.cluster import on_all_cores
 from iwm_sim.road_report import text as road_text
@@ -25,7 +26,7 @@ from iwm_sim.road_run import check_scenario
 from iwm_sim.scenario import load_scenario
 from iwm_sim.study import ablation, battery_fit, cases, frontier, frontier_figure, paper, reproduce, single, unseen
 from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result, SensorNoise
-from iwm_sim.study.driving import Progress, drive_all, progress_of, silent, tell, warm_up, with_rules
+from iwm_sim.study.driving import Progress, drive_all, silent, tell, warm_up, with_rules
 from iwm_sim.study.names import REFERENCE
 from iwm_sim.study.plan import Policies
 from iwm_sim.study.policies import PolicySource
@@ -56,7 +57,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         warm_up(wanted, say)
         wanted = with_rules(wanted, options.jobs)
         drive = _Saving(options.save_series) if options.save_series else cases.result
-        results = drive_all(wanted, options.jobs, progress.update, drive)
+        results = drive_all(wanted, options.jobs, progress.done, drive)
     rows = rows_of(results)
     if not options.quiet:
         print(text_table(rows))
@@ -196,6 +197,13 @@ def _folder(path: str) -> Path:
     return folder
 
 
+def _only[Value](option: str, values: Sequence[Value], default: Value) -> Value:
+    """The value of an option that may be given several times, but not here."""
+    if len(values) > 1:
+        raise ConfigError("arguments", option, f"has {len(values)} values", "one here")
+    return values[0] if values else default
+
+
 # --- instead of cases -----------------------------------------------------------------------------------------------
 
 
@@ -263,10 +271,10 @@ def _ablation(options: argparse.Namespace) -> None:
 
 
 def _fit_battery(options: argparse.Namespace) -> None:
-    friction = (options.friction or [0.9])[0]
+    friction = _only("--friction", options.friction, 0.9)
     fit = battery_fit.fit(
         options.vehicle,
-        (options.idle_drive or [""])[0],
+        _only("--idle-drive", options.idle_drive, ""),
         options.cycle or battery_fit.CYCLES,
         friction,
         options.initial_soc,
@@ -282,7 +290,7 @@ def _fit_battery(options: argparse.Namespace) -> None:
 
 def _scenario(options: argparse.Namespace) -> None:
     """Each scenario with each strategy: what comes out, beside what is required."""
-    idle_drive = (options.idle_drive or [""])[0] or None
+    idle_drive = _only("--idle-drive", options.idle_drive, "") or None
     scenarios = [load_scenario(name, idle_drive) for name in dict.fromkeys(options.scenario)]
     strategies = list(dict.fromkeys(options.strategy or [DEFAULT_STRATEGY]))
     for strategy in strategies:
@@ -332,14 +340,14 @@ def _show_frontier(made: frontier.Frontier, picture: Path) -> None:
 
 def _unseen(options: argparse.Namespace) -> None:
     folder = _folder(options.unseen)
-    idle_drive = (options.idle_drive or [""])[0]
+    idle_drive = _only("--idle-drive", options.idle_drive, "")
     wanted = unseen.cells(options.vehicle, idle_drive, options.seeds, options.cycles, options.cars)
     if not wanted:
         raise ConfigError("arguments", "--unseen", "has neither cycles nor cars", "--cycles or --cars")
     say = silent if options.quiet else tell
     started = time.perf_counter()
     say(f"{len(wanted)} cells from seed {options.seeds} on; policies for cars of their own are solved first")
-    with progress_of(len(wanted), "cell", options.quiet) as bar:
+    with Bar(len(wanted), "cells", quiet=options.quiet) as bar:
         made = on_all_cores(unseen.drive_cell, wanted, options.jobs, lambda _: bar.update())
     write_json(folder / "unseen.json", unseen.to_json(made))
     frontier_figure.draw_margins(made, folder / "margins.svg")

@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from iwm_power_manager import __version__
+from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.control.strategies import drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.tools.command import described, ended, picture, write_json
 from iwm_power_manager.tools.options import number, several, whole
+from iwm_power_manager.tools.progress import Bar
 from iwm_sim.study.names import cores
 
 _DESCRIPTION = """\
@@ -49,14 +51,13 @@ command again to go on)
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
-    style: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
-    result = described("fleet", _DESCRIPTION, _EXAMPLES, abbreviated=False)
+    result = described("fleet", _DESCRIPTION, _EXAMPLES)
     commands = result.add_subparsers(dest="command", required=True, metavar="drive | solve | report")
     for name, words in (("drive", "drive every car everywhere"), ("solve", "solve every policy, drive nothing")):
-        command = commands.add_parser(name, help=words, description=_DESCRIPTION, epilog=_EXAMPLES, **style)
+        command = commands.add_parser(name, help=words, description=_DESCRIPTION, epilog=_EXAMPLES)
         _add_fleet(command.add_argument_group("fleet (an option takes the place of the file's key)"), name)
         _add_running(command.add_argument_group("running"))
-    report = commands.add_parser("report", help="one page of a study", allow_abbrev=False)
+    report = commands.add_parser("report", help="one page of a study")
     report.add_argument("folder", type=Path, metavar="DIR", help="folder of a study")
     report.add_argument("--page", type=Path, metavar="HTML", help="the page (default: DIR/fleet.html)")
     report.add_argument("--picture", type=picture, metavar="PICTURE", help="its first picture: .pdf, .png or .svg")
@@ -105,10 +106,6 @@ def _given(options: argparse.Namespace) -> dict[str, Any]:
     if options.vehicle:
         drives = {"idle_drive": options.idle_drive} if options.idle_drive else {}
         given["cars"] = [{"vehicle": options.vehicle} | drives]
-    elif options.idle_drive:
-        raise ConfigError(
-            "arguments", "--idle-drive", "has no effect without --vehicle", "--vehicle, or the fleet file"
-        )
     elif not options.file:
         raise ConfigError("arguments", "", "names no fleet", "a YAML file, or --vehicle")
     return given
@@ -123,20 +120,21 @@ def _run(options: argparse.Namespace) -> None:
     from iwm_sim.fleet.run import runner
     from iwm_sim.fleet.store import Store
     from iwm_sim.fleet.task import Drive, Road, Solve
-    from iwm_sim.study.driving import progress_of, silent, tell
+    from iwm_sim.study.driving import silent, tell
 
     parts: list[tuple[type[Any], Sequence[Any]]] = [(Solve, plan.solves)]
     if options.command == "drive":
         if not plan.drives and not plan.roads:
             raise ConfigError(options.file or "arguments", "cycles", "is missing", "cycles or scenarios to drive")
         parts = [(Solve, needed(plan)), (Drive, plan.drives), (Road, plan.roads)]
+    _check_options(options, bool(parts[0][1]), any(case.policy for drive in plan.drives for case in drive.cases))
     say: Callable[[str], None] = silent if options.quiet else tell
     store = Store(options.output)
     made = {}
     with runner(store, plan.files, options.scheduler, options.jobs, options.batch) as running:
         running.check_workers(say)
         for kind, tasks in parts:
-            with progress_of(len(tasks), kind.__name__.lower(), options.quiet or not tasks) as bar:
+            with Bar(len(tasks), "tasks", kind.__name__.lower(), quiet=options.quiet or not tasks) as bar:
                 made[kind.__name__.lower()] = running.run(kind, tasks, bar.update)
     if not options.quiet:
         for name, summary in made.items():
@@ -147,6 +145,22 @@ def _run(options: argparse.Namespace) -> None:
     if options.json:
         content = {"package_version": __version__} | {name: summary._asdict() for name, summary in made.items()}
         write_json(options.json, content)
+
+
+def _check_options(options: argparse.Namespace, solves: bool, drives_policies: bool) -> None:
+    """Refuse what changes nothing: whether policies are solved, and whether cycles are driven with them, is known."""
+    of_no_policy = "no strategy here takes a policy"
+    alone = options.command == "solve"
+    refuse_without_effect(
+        options,
+        {
+            "--idle-drive": (options.vehicle, "it is for --vehicle; a fleet file says it for its own cars"),
+            "--jobs": (not options.scheduler, "the workers of --scheduler are used"),
+            "--grid": (solves, of_no_policy),
+            "--budget": (alone or drives_policies, f"{of_no_policy} on a cycle"),
+            "--friction": (alone or drives_policies or options.cycle or options.file, "scenarios have their own"),
+        },
+    )
 
 
 def _report(options: argparse.Namespace) -> None:

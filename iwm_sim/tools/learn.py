@@ -13,9 +13,9 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from iwm_power_manager import __version__
+from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import check_number
@@ -26,7 +26,8 @@ from iwm_power_manager.replay.demand import drive_source, read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import load_grid, targets
 from iwm_power_manager.tools.command import described, ended, write_json
-from iwm_power_manager.tools.options import several
+from iwm_power_manager.tools.options import several, whole
+from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.learning import (
     BANDWIDTHS,
@@ -44,7 +45,6 @@ from iwm_sim.learning import (
     learn,
     recorded_cycle,
 )
-from iwm_sim.study.driving import progress_of
 from iwm_sim.study.names import cores
 
 _DESCRIPTION = """\
@@ -110,7 +110,9 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument("--grid", default="coupled", metavar="NAME|FILE", help="grid (default: %(default)s)")
     result.add_argument("--idle-drive", choices=sorted(IDLE_DRIVES), help="replaces the car's idle_drive")
-    result.add_argument("--jobs", type=int, default=cores(), metavar="N", help="processes (default: one for each core)")
+    result.add_argument(
+        "--jobs", type=whole(1, 1024), default=cores(), metavar="N", help="processes (default: one for each core)"
+    )
     result.add_argument("--json", metavar="FILE", help="write the numbers, too")
     result.add_argument("--quiet", action="store_true", help="print errors only")
     return result
@@ -126,6 +128,9 @@ def _learn(options: argparse.Namespace) -> None:
     _check(options)
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
     problem = load_grid(options.grid, vehicle.params)
+    refuse_without_effect(
+        options, {"--bandwidths": (problem.demand_by_speed, f"grid {problem.name} has one demand for all speeds")}
+    )
     frictions = [check_number("arguments", "--friction", value, 0.01, 2.0) for value in options.friction]
     paths = targets(Path(options.output), vehicle, problem, frictions)
     general = tuple(source_of(load_cycle(resolve(name)), problem, vehicle.params) for name in options.cycle or CYCLES)
@@ -141,7 +146,7 @@ def _learn(options: argparse.Namespace) -> None:
     for friction, path in zip(frictions, paths, strict=True):
         with tempfile.TemporaryDirectory(prefix="iwm-learn-") as folder:
             task = Task(problem, vehicle, friction, recorded, general, drives, folder)
-            learned = _tried(task, candidates, max(options.jobs, 1), options.quiet)
+            learned = _tried(task, candidates, options.jobs, options.quiet)
         save_policy(learned.policy, path)
         if not options.quiet:
             print(_text(task, learned, path))
@@ -172,15 +177,15 @@ def _check(options: argparse.Namespace) -> None:
 
 def _tried(task: Task, candidates: Sequence[Candidate], jobs: int, quiet: bool) -> Learned:
     """Try candidates with a bar, and say after the first how long all of them will take."""
-    with progress_of(len(candidates), "policy", quiet, f"friction {task.friction:g}") as bar:
-        return learn(task, candidates, jobs, _announcing(bar, len(candidates), jobs))
+    with Bar(len(candidates), "policies", f"friction {task.friction:g}", quiet=quiet) as bar:
+        return learn(task, candidates, jobs, _announcing(bar, len(candidates), jobs, quiet))
 
 
-def _announcing(bar: Any, count: int, jobs: int) -> Callable[[Outcome], None]:
+def _announcing(bar: Bar, count: int, jobs: int, quiet: bool) -> Callable[[Outcome], None]:
     started = time.perf_counter()
 
     def done(_: Outcome) -> None:
-        if bar.n == 0 and not bar.disable:
+        if bar.n == 0 and not quiet:
             took_s = time.perf_counter() - started
             whole_min = took_s * (1 + (count - 1) / jobs) / 60.0
             bar.write(f"{count} policies are solved and driven; by the first, about {whole_min:.1f} min", sys.stderr)

@@ -14,7 +14,13 @@ from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import IwmError
 
 #: What the work needs, but `--help` does not.
-NEEDS = ("iwm_power_manager.compilation", "iwm_power_manager.solve", "iwm_sim.drive", "iwm_sim.preview", "tqdm")
+NEEDS = (
+    "iwm_power_manager.compilation",
+    "iwm_power_manager.solve",
+    "iwm_power_manager.tools.progress",
+    "iwm_sim.drive",
+    "iwm_sim.preview",
+)
 
 #: Kernels of earlier versions that nobody has read for so long are removed, s.
 UNUSED_FOR_S = 60 * 86400.0
@@ -126,16 +132,16 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compile everything; returns the exit code."""
     options = parser().parse_args(arguments)
-    from tqdm import tqdm
-
     from iwm_power_manager import compilation, kernel_cache
+    from iwm_power_manager.tools.progress import Bar
 
     try:
         work = list(jobs())
-        with tqdm(work, desc="compiling", unit="part", disable=options.quiet or None, file=sys.stderr) as bar:
-            for name, job in bar:
+        with Bar(len(work), "parts", "compiling", quiet=options.quiet) as bar:
+            for name, job in work:
                 bar.set_postfix_str(name)
                 job()
+                bar.update()
     except IwmError as error:
         print(f"precompile: error: {error}", file=sys.stderr)
         return error.exit_code

@@ -206,6 +206,13 @@ def test_a_bag_that_is_not_there_is_answered_with_the_names_near_it(tmp_path: Pa
         BagReader(tmp_path / "drive_1")
 
 
+def test_a_folder_above_a_bag_that_is_not_there_is_answered_with_the_names_near_it(tmp_path: Path) -> None:
+    (tmp_path / "drive" / "bag").mkdir(parents=True)
+    (tmp_path / "drives").mkdir()
+    with pytest.raises(BagError, match=r"drve/bag: does not exist; did you mean [^ ]*drive/bag\?$"):
+        BagReader(tmp_path / "drve" / "bag")
+
+
 def test_a_compressed_message_that_is_damaged_stays_as_it_is_and_is_reported(tmp_path: Path) -> None:
     torn = b"\x28\xb5\x2f\xfd" + bytes(3)
     with BagWriter(tmp_path / "bag") as bag:

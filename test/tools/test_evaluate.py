@@ -138,9 +138,18 @@ def test_the_papers_strategy_has_a_name_a_grid_and_a_period_of_its_own(hill, sma
         (["--switching-cost", "5"], "--switching-cost: has no effect"),
         (["--seed", "3"], "there is no --noise"),
         (["--gate-mode", "off", "--no-gate-driving"], "gates nothing"),
+        (["--gate-mode", "off", "--critical-slip", "0.1"], "gates nothing"),
         (["--plot", "a.svg"], "--plot: has no effect"),
-        (["--study", "out"], "--cycle: has no effect with --study"),
-        (["--fit-battery", "--dt", "0.02"], "--dt: has no effect with --fit-battery"),
+        (["--strategy", "equal", "--no-solve"], "--no-solve: has no effect"),
+        (["--strategy", "instantaneous", "--assumed-friction", "0.5"], "--assumed-friction: has no effect"),
+        (["--friction-source", "estimated", "--assumed-friction", "0.5"], "--assumed-friction: has no effect"),
+        (["--friction-source", "estimated", "--grid", "fine"], "--grid: has no effect"),
+        (["--budgets", "4"], "it is for --frontier"),
+        (["--seeds", "4"], "it is for --unseen"),
+        (["--study", "out"], "--cycle: has no effect: not with --study"),
+        (["--fit-battery", "--dt", "0.02"], "--dt: has no effect: not with --fit-battery"),
+        (["--fit-battery", "--friction", "0.9", "0.5"], "--friction: has 2 values; allowed: one here"),
+        (["--paper", "3", "--friction", "0.5"], "not with --paper: table 3 is of 0.9"),
     ],
 )
 def test_an_option_without_effect_is_refused(arguments, words, capsys):
@@ -166,6 +175,18 @@ def test_a_figure_says_what_it_was_drawn_for(tmp_path, capsys):
     assert evaluate.main(["--figure", "8", "--plot", str(tmp_path / "eight.svg")]) == 0
     assert "idle drive none" in capsys.readouterr().out
     assert "idle drive none" in (tmp_path / "eight.svg").read_text()  # matplotlib notes each text in a comment
+
+
+def test_a_figure_refuses_what_it_does_not_heed(capsys):
+    assert evaluate.main(["--figure", "9", "--policy", "policies", "--plot", "nine.svg"]) == 2
+    assert "--policy: has no effect: not with --figure 9" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "words"), [("11", "a flow chart"), ("4", "the tyre's formula")])
+def test_a_figure_without_a_result_is_refused_with_what_it_shows(name, words, capsys):
+    with pytest.raises(SystemExit):
+        evaluate.main(["--figure", name, "--plot", "a.svg"])
+    assert f"figure {name} is {words}" in capsys.readouterr().err
 
 
 def test_a_figure_needs_a_file(capsys):

@@ -52,8 +52,12 @@ def test_policies_are_solved_alone(small_grid, tmp_path, capsys):
     [
         (["drive"], "arguments: names no fleet; allowed: a YAML file, or --vehicle"),
         (["drive", "--vehicle", "jalalmaab_2015"], "arguments: cycles: is missing"),
-        (["drive", "--idle-drive", "drag"], "--idle-drive: has no effect without --vehicle"),
+        (["drive", "--idle-drive", "drag"], "names no fleet"),
         (["drive", "smal"], "did you mean small"),
+        (["drive", "small", "--idle-drive", "drag"], "--idle-drive: has no effect: it is for --vehicle"),
+        (["drive", "small", "--strategy", "equal", "--grid", "fine"], "--grid: has no effect: no strategy here"),
+        (["drive", "small", "--strategy", "equal", "--budget", "4"], "--budget: has no effect: no strategy here"),
+        (["drive", "small", "--scheduler", "tcp://nowhere:1", "--jobs", "2"], "--jobs: has no effect"),
         (["drive", *CAR, "--cycle", "nycc", "--friction", "0.9", "--output", "/proc/no/study"], "cannot be made"),
     ],
 )
