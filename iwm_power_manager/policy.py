@@ -111,6 +111,11 @@ class Policy:
         )
 
     @property
+    def identity(self) -> str:
+        """Grid and checksum, as results name their policy."""
+        return f"{self.problem.name} {self.checksum[:8]}"
+
+    @property
     def proven_j(self) -> float | None:
         """What the residual proves: distance of `cost_j` from the optimal cost-to-go at most, J."""
         return None if self.residual_j is None else self.residual_j / (1.0 - self.problem.discount)

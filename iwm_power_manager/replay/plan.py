@@ -97,6 +97,11 @@ class PolicyBank:
         return [policy.checksum for policy in self._bank or []]
 
     @property
+    def used(self) -> list[str]:
+        """Grid and checksum of the policies that steps were decided with so far."""
+        return [policy.identity for policy in self._bank or [] if policy.checksum in self._tables]
+
+    @property
     def content_sha256(self) -> str:
         """Hash of the file or folder, as a recorder takes it; "" if no step needed a policy."""
         return content_sha256(resolve(self._path)) if self._bank else ""

@@ -10,6 +10,7 @@ driver's reaction to power that was not delivered, another mass.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
@@ -44,6 +45,8 @@ class Consumption(NamedTuple):
     wheel_work_wh : work of motors, brakes and idle drag at the wheels
     friction_wh : of that, turned into heat by the friction brakes
     idle_drag_wh : of that, dragged by idle motors
+    step_s : mean length of a control step
+    friction : least and greatest that the law assumed
     """
 
     label: str
@@ -53,6 +56,8 @@ class Consumption(NamedTuple):
     wheel_work_wh: float
     friction_wh: float
     idle_drag_wh: float
+    step_s: float
+    friction: tuple[float, float]
 
     @property
     def wh_per_km(self) -> float:
@@ -72,7 +77,9 @@ class EnergyMeter:
     def __init__(self, label: str, vehicle: VehicleParams) -> None:
         self._label = label
         self._vehicle = vehicle
-        self._distance_m = 0.0
+        self._distance_m = self._time_s = 0.0
+        self._steps = 0
+        self._friction = (math.inf, -math.inf)
         self._joules = [0.0] * 5
 
     def add(self, measurement: Measurement, motor_torque_nm: Wheels, friction_torque_nm: Wheels) -> None:
@@ -93,12 +100,17 @@ class EnergyMeter:
             work += (torque + brake) * speed - dragging
         chemical = chemical_power_w(electrical, self._vehicle.battery)
         self._distance_m += measurement.speed_mps * dt_s
+        self._time_s += dt_s
+        self._steps += 1
+        self._friction = min(self._friction[0], measurement.friction), max(self._friction[1], measurement.friction)
         for i, power in enumerate((chemical, electrical, work, friction, drag)):
             self._joules[i] += power * dt_s
 
     def result(self) -> Consumption:
         """The sums so far."""
-        return Consumption(self._label, self._distance_m, *(joules / _J_PER_WH for joules in self._joules))
+        step_s = self._time_s / max(self._steps, 1)
+        wh = [joules / _J_PER_WH for joules in self._joules]
+        return Consumption._make((self._label, self._distance_m, *wh, step_s, self._friction))
 
 
 def what_if(

@@ -7,7 +7,7 @@ import argparse
 import io
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,17 @@ def described(name: str, description: str, examples: str) -> argparse.ArgumentPa
     parser = CommandParser(name, description=description, epilog=examples)
     parser.add_argument("--version", action="version", version=f"{name} {__version__}")
     return parser
+
+
+def made_with(
+    friction: str, idle_drive: str, rate_hz: float, period_s: float = 0.0, policies: Iterable[str] = ()
+) -> str:
+    """What a result depends on, as every result says it: road, car, control rate, decision period, policies if any."""
+    parts = [f"friction {friction}, idle drive {idle_drive}, control at {rate_hz:.4g} Hz"]
+    parts += [f"split decided every {period_s:g} s"] if period_s else []
+    named = list(dict.fromkeys(filter(None, policies)))
+    parts += [f"polic{'ies' if len(named) > 1 else 'y'} {', '.join(named)}"] if named else []
+    return ", ".join(parts)
 
 
 def ended(name: str, work: Callable[[], int | None]) -> int:

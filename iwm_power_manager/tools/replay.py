@@ -30,7 +30,7 @@ from iwm_power_manager.replay.plan import Choice, Plan, make_plan, recorded_mapp
 from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds, report_topics
 from iwm_power_manager.replay.what_if import Consumption, what_if
 from iwm_power_manager.signals.mapping import SignalMapping
-from iwm_power_manager.tools.command import described, ended
+from iwm_power_manager.tools.command import described, ended, made_with
 from iwm_power_manager.tools.options import number, whole
 from iwm_power_manager.tools.progress import Bar
 
@@ -190,19 +190,32 @@ def _what_if(bag: BagReader, options: argparse.Namespace) -> int:
         rows = what_if(bag, plans, progress)
     savings = [row.saving_percent(rows[0]) for row in rows]
     lines = [
-        f"{bag.path}: open-loop estimate for {plans[0][1].vehicle.name}, idle drive {plans[0][1].vehicle.idle_drive}",
+        f"{bag.path}: open-loop estimate for {plans[0][1].vehicle.name}",
         f"  {'':20} {'Wh':>9} {'Wh/km':>8} {'at wheels':>10} {'brakes':>8} {'idle drag':>9} {'saving':>8}",
         *(_consumption_line(row, saving) for row, saving in zip(rows, savings, strict=True)),
         f"  at the force of {rows[0].label}, step by step; it tells losses, not how slip or the driver would differ",
     ]
-    if used := sorted({checksum[:12] for _, plan in plans for checksum in plan.policies.checksums}):
-        lines.append(f"  policies {', '.join(used)}; settings as recorded, unless --set or --strategy says otherwise")
+    lines += [f"  {text}" for text in _made_with(rows, plans)]
+    lines.append("  settings as recorded, unless --set or --strategy says otherwise")
     if None in savings:
         lines.append("  no saving where the motors could not give that force: the work at the wheels is another")
     lines += [f"  damaged: {line}" for line in bag.damage]
     found = [{**row._asdict(), "saving_percent": saving} for row, saving in zip(rows, savings, strict=True)]
     _show(lines, {"bag": str(bag.path), "rows": found, "damage": bag.damage}, options)
     return DONE
+
+
+def _made_with(rows: Sequence[Consumption], plans: Sequence[tuple[str, Plan]]) -> list[str]:
+    """What the rows depend on; strategies that differ in nothing but their name share a line."""
+    found: dict[str, list[str]] = {}
+    by_label = {row.label: row for row in rows}
+    for label, plan in plans:
+        low, high = (f"{value:.3g}" for value in by_label[label].friction)
+        friction = low if low == high else f"{low}..{high}"
+        period_s = plan.settings.decision_period_s
+        how = (plan.vehicle.idle_drive, 1.0 / by_label[label].step_s, period_s, plan.policies.used)
+        found.setdefault(made_with(friction, *how), []).append(label)
+    return [f"{', '.join(labels)}: {text}" for text, labels in found.items()]
 
 
 def _consumption_line(row: Consumption, saving: float | None) -> str:

@@ -65,7 +65,7 @@ class Curve(NamedTuple):
     Attributes
     ----------
     label : what it was computed for
-    front_power_w : (N,)
+    front_power_w : (N,), the first and the last where one axle rests
     delta_soc_percent : (N,) depletion of one step, NaN where the split cannot be driven
     """
 
@@ -125,13 +125,19 @@ def depletion_over_split(curves: Sequence[Curve], title: str = "") -> Figure:
 
 @_styled
 def depletion_over_split_panels(panels: Sequence[tuple[str, Sequence[Curve]]]) -> Figure:
-    """Fig. 10: the same for several demands, a titled panel each. The least depletion of a curve carries a dot."""
+    """Fig. 10: the same for several demands, a titled panel each. The least depletion of a curve carries a dot.
+
+    The ends of a curve, where one axle rests, are rings of their own: depletion jumps there.
+    """
     figure, axes = _axes(len(panels), height_in=1.2 + 2.2 * len(panels), share_x=False)
     for axis, (title, curves) in zip(axes, panels, strict=True):
         for index, curve in enumerate(curves):
             power_kw = np.asarray(curve.front_power_w, dtype=np.float64) / 1000.0
             depletion = np.asarray(curve.delta_soc_percent, dtype=np.float64)
-            axis.plot(power_kw, depletion, color=COLOURS[index % 6], label=curve.label)
+            axis.plot(power_kw[1:-1], depletion[1:-1], color=COLOURS[index % 6], label=curve.label)
+            axis.plot(
+                power_kw[[0, -1]], depletion[[0, -1]], "o", markersize=5, color=COLOURS[index % 6], fillstyle="none"
+            )
             if np.isfinite(depletion).any():
                 # A tie within a billionth is a tie: both of two symmetric optima are marked.
                 least = np.nanmin(depletion)

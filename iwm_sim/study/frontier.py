@@ -25,6 +25,7 @@ from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.policy import Policy
+from iwm_power_manager.tools.command import made_with
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import closed_loop, preview
 from iwm_sim.closed_loop import Noise, Run
@@ -191,12 +192,12 @@ def measure_frontier(
     for policy in policies:
         run = drive(place, OURS, policy.table())
         point = _point(OURS, policy.problem.changes_per_min, run, place, reference)
-        ours.append(point._replace(policy=f"{policy.problem.name} {policy.checksum[:8]}"))
+        ours.append(point._replace(policy=policy.identity))
         if bounds:
             limits.append(_bound(place, reference, run, [*rivals, ours[-1]], ours[-1]))
-    law = f"control at {1.0 / _DT_S:g} Hz, split decided every {default_settings().decision_period_s:g} s"
-    made_with = f"friction {place.friction:g}, idle drive {place.vehicle.idle_drive}, {law}"
-    return Frontier(place.label, made_with, tuple(rivals), tuple(ours), tuple(limits))
+    period_s = default_settings().decision_period_s
+    how = made_with(f"{place.friction:g}", place.vehicle.idle_drive, 1.0 / _DT_S, period_s)
+    return Frontier(place.label, how, tuple(rivals), tuple(ours), tuple(limits))
 
 
 def margin(point: Point, rivals: Sequence[Point], count: str) -> float | None:

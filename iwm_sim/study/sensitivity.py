@@ -21,6 +21,8 @@ FloatArray = npt.NDArray[np.float64]
 
 STEP_S = 0.1
 _POINTS = 101
+#: A part of the demand that is next to nothing.
+_HARDLY = 1e-9
 
 #: Figure 8: speeds, m/s, at one demand; Figure 9: front slips at one speed and demand; Figure 10: demands. The demand
 #: of Figure 8 and the speed of Figure 10 are not in the text.
@@ -48,8 +50,12 @@ def depletion_percent(
 
 
 def curve(label: str, demand_w: float, speed_mps: float, front_slip: float, vehicle: VehicleParams) -> Curve:
-    """Depletion over all front powers from nothing to the whole demand, the rear slip at 0.01."""
-    power: FloatArray = np.linspace(0.0, demand_w, _POINTS)
+    """Depletion over all front powers from nothing to the whole demand, the rear slip at 0.01.
+
+    An axle that rests takes another power than one that hardly works: both ends stand twice, alone and as limits.
+    """
+    inner = np.linspace(0.0, 1.0, _POINTS)[1:-1]
+    power: FloatArray = demand_w * np.array([0.0, _HARDLY, *inner, 1.0 - _HARDLY, 1.0])
     depletion = [depletion_percent(float(p), demand_w, speed_mps, front_slip, 0.01, vehicle) for p in power]
     return Curve(label, power, depletion)
 

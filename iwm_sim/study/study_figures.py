@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from iwm_power_manager.mdp.demand import DemandChain
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.policy import Policy
+from iwm_power_manager.tools.command import made_with
 from iwm_sim.metrics import CRITICAL_SLIP
 from iwm_sim.study import battery_fit, figures, sensitivity
 from iwm_sim.study.cases import Result, Rule
@@ -25,6 +26,7 @@ FloatArray = npt.NDArray[np.float64]
 
 #: Of all figures, and of the paper's eq. 23.
 _IDLE = "idle drive none"
+_DRIVEN = made_with("0.2", "none", 100.0)
 #: When Figures 14 and 15 look.
 WINDOW_S = (345.0, 430.0)
 
@@ -80,8 +82,8 @@ def battery_figure(fit: battery_fit.Fit) -> Drawn:
     return Drawn(
         "figure_07_battery",
         "Figure 7: plant and control model",
-        f"Speed and state of charge, equal split, idle drive {fit.idle_drive}; the control model has a static circuit, "
-        "fitted.",
+        f"Speed and state of charge, equal split, idle drive {fit.idle_drive}, control at 100 Hz; the control model "
+        "has a static circuit, fitted.",
         figures.model_comparison(*fit.comparison),
         BATTERY,
     )
@@ -143,7 +145,7 @@ def rule_figure(rule: Rule) -> Drawn:
     return Drawn(
         "figure_13_rule",
         "Figure 13: the generalized rule",
-        f"Dynamic programming on FTP-75, friction 0.9, {_IDLE}, and the line fitted to it.",
+        f"Dynamic programming on FTP-75, {made_with('0.9', 'none', 100.0)}, and the line fitted to it.",
         figures.fitted_rule(demand, rule.front_share * demand, line_w, _rule_power(rule.coefficients, line_w)),
         TABLES,
     )
@@ -165,14 +167,14 @@ def window_figures(window: dict[str, dict[str, FloatArray]]) -> list[Drawn]:
         Drawn(
             "figure_14_powers",
             "Figure 14: powers of the axles",
-            f"UDDS, friction 0.2, {_IDLE}.",
+            f"UDDS, {_DRIVEN}; ours decides every 0.02 s.",
             figures.axle_powers(time_s, powers, span),
             TABLE_6,
         ),
         Drawn(
             "figure_15_slips",
             "Figure 15: slips with and without skid avoidance",
-            f"UDDS, friction 0.2, {_IDLE}: the paper's SDP without skid avoidance, and ours.",
+            f"UDDS, {_DRIVEN}: the paper's SDP without skid avoidance, decided every 0.1 s, and ours, every 0.02 s.",
             figures.slips(time_s, slips, CRITICAL_SLIP, span),
             TABLE_6,
         ),

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
+from iwm_power_manager.tools.command import made_with
 from iwm_sim.study.report import Column
 from iwm_sim.study.rows import Row, policy_text
 
@@ -23,8 +25,8 @@ def _possible(row: Row) -> float | None:
     return 100.0 * row.share_of_possible if row.share_of_possible and row.share_of_possible > 0.0 else None
 
 
-def _period(row: Row) -> float | None:
-    return row.made_with["settings"]["decision_period_s"] if row.made_with else None
+def _period(row: Row) -> Any:
+    return row.made_with["settings"]["decision_period_s"]
 
 
 #: Columns of the results of `evaluate`.
@@ -56,9 +58,8 @@ def text_table(rows: Sequence[Row], columns: Sequence[Column[Row]] = COLUMNS) ->
     for row, line in zip(rows, cells, strict=True):
         if row.place != before:
             before = row.place
-            title = f"{before.cycle}, friction {before.friction:g}, idle drive {before.idle_drive}"
-            rate = f", control at {1.0 / row.made_with['dt_s']:g} Hz" if row.made_with else ""
-            lines += ["", title + rate, _aligned(head, widths, columns)]
+            how = made_with(f"{before.friction:g}", before.idle_drive, 1.0 / row.made_with["dt_s"])
+            lines += ["", f"{before.cycle}, {how}", _aligned(head, widths, columns)]
         lines.append(_aligned(line, widths, columns))
     return "\n".join(lines[1:])
 

@@ -194,7 +194,10 @@ def kinds(frontiers: Sequence[Frontier]) -> list[Kind]:
 def report(frontiers: Sequence[Frontier], worst: int = 10) -> str:
     """The verdicts and the worst cells, as text."""
     lost = sum(not point.held for f in frontiers for point in f.ours)
-    lines = [f"{len(frontiers)} cells, {lost} of them without a held trace or an equal split that held it"]
+    lines = [
+        f"{len(frontiers)} cells, {lost} of them without a held trace or an equal split that held it",
+        _made_with(frontiers),
+    ]
     lines += [
         f"{verdict.counted}: {verdict.cells} cells, margin mean {verdict.mean:+.3f}, lowest twentieth below "
         f"{verdict.lowest_twentieth:+.3f}, worst {verdict.worst:+.3f} points; no more than {CLOSE:g} below in "
@@ -214,6 +217,15 @@ def report(frontiers: Sequence[Frontier], worst: int = 10) -> str:
             f"{value:+.3f}  {point.saving_percent:.3f}  {point.changes_per_min:.1f}  {point.busiest_minute}  {f.label}"
         )
     return "\n".join(lines)
+
+
+def _made_with(frontiers: Sequence[Frontier]) -> str:
+    """What all cells have in common, with the policies; of drawn cars, which have some each, their number."""
+    common = dict.fromkeys(f.made_with.partition(", ")[2] for f in frontiers)
+    drawn = {(f.label.startswith("car "), point.policy) for f in frontiers for point in f.ours}
+    own = sorted(policy for of_drawn, policy in drawn if not of_drawn)
+    of_cars = [f"{len(drawn) - len(own)} of drawn cars, each solved for its own"] if len(drawn) > len(own) else []
+    return f"{'; '.join(common)}; policies: {', '.join(own + of_cars)}"
 
 
 def to_json(frontiers: Sequence[Frontier]) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES, d
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_power_manager.exit_codes import DONE, FAILED, INTERRUPTED
 from iwm_power_manager.model.parameters import IDLE_DRIVES
+from iwm_power_manager.tools import command
 from iwm_power_manager.tools.options import number
 from iwm_sim import metrics
 from iwm_sim.closed_loop import Run
@@ -263,8 +264,8 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
 
 def made_with(plan: Plan, loaded: Loaded) -> str:
     """What the numbers depend on, in a line."""
-    law = f"control at {plan.rate_hz:g} Hz, split decided every {loaded.settings.decision_period_s:g} s"
-    return f"friction {plan.friction:g}, idle drive {loaded.vehicle.idle_drive}, {law}, policy {loaded.policy_identity}"
+    law = (plan.rate_hz, loaded.settings.decision_period_s, [loaded.policy_identity])
+    return command.made_with(f"{plan.friction:g}", loaded.vehicle.idle_drive, *law)
 
 
 def described(plan: Plan, loaded: Loaded, notes: Mapping[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.feasible import trace_warnings
-from iwm_power_manager.tools.command import PICTURES, write_json, write_picture
+from iwm_power_manager.tools.command import PICTURES, made_with, write_json, write_picture
 from iwm_power_manager.tools.progress import Bar
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.cluster import on_all_cores
@@ -241,8 +241,7 @@ def _policies_text(policies: Policies) -> str:
     lines = ["control at 100 Hz; ours decides every 0.02 s, the paper's every 0.1 s; policies:"]
     for (name, idle_drive, friction), path in policies.used.items():
         policy = cases.policy_of(path)
-        identity = f"{policy.problem.name} {policy.checksum[:8]}"
-        lines.append(f"  {name}, idle drive {idle_drive}, friction {friction:g}: {identity}")
+        lines.append(f"  {name}, idle drive {idle_drive}, friction {friction:g}: {policy.identity}")
     return "\n".join(lines)
 
 
@@ -280,7 +279,7 @@ def _fit_battery(options: argparse.Namespace) -> None:
         options.initial_soc,
     )
     if not options.quiet:
-        print(f"{fit.text()}\nequal split, friction {friction:g}, idle drive {fit.idle_drive}, control at 100 Hz")
+        print(f"{fit.text()}\nequal split, {made_with(f'{friction:g}', fit.idle_drive, 100.0)}")
     if options.plot:
         write_picture(options.plot, battery_figure(fit).captioned())
         tell(f"picture: {options.plot}")
@@ -301,9 +300,10 @@ def _scenario(options: argparse.Namespace) -> None:
         for strategy in strategies:
             result = check_scenario(scenario, law_settings.default_settings(strategy))
             if not options.quiet:
-                car, law = scenario.vehicle, law_settings.default_settings(strategy)
-                how = f"control at 100 Hz, decided every {law.decision_period_s:g} s, policies of the folder policies"
-                print(f"{strategy}, {car.name}, idle drive {car.idle_drive}, {how}\n{road_text(result)}", flush=True)
+                law = law_settings.default_settings(strategy)
+                how = made_with("of its roads", scenario.vehicle.idle_drive, 100.0, law.decision_period_s)
+                print(f"{strategy}, {scenario.vehicle.name}, {how}, policies of the folder policies")
+                print(road_text(result), flush=True)
             made = {"scenario": scenario.name, "strategy": strategy, "passed": result.passed}
             rows.append(made | {"values": result.values})
     if options.json:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -514,6 +515,14 @@ def test_what_if_shows_the_recorded_energy_and_that_of_each_strategy(
     assert rows["equal"]["chemical_wh"] != rows["recorded"]["chemical_wh"]
     assert rows["equal"]["distance_m"] == rows["recorded"]["distance_m"] > 1.0
     assert rows["equal"]["idle_drag_wh"] < rows["recorded"]["idle_drag_wh"]
+
+
+def test_what_if_says_what_it_was_made_with(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(drive), "--what-if", "jalalmaab_2015", "--strategy", "equal", "sdp", "--friction", "0.5"]) == DONE
+    lines = [line for line in capsys.readouterr().out.splitlines() if "control at" in line]
+    made = "friction 0.5, idle drive drag, control at 100 Hz, split decided every 0.02 s"
+    assert lines[0] == f"  equal: {made}"
+    assert re.fullmatch(rf"  sdp: {made}, policy coupled [0-9a-f]{{8}}", lines[1])
 
 
 def test_energy_of_a_constant_step_is_power_times_time(drive: Path) -> None:

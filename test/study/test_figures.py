@@ -49,20 +49,27 @@ def test_building_leaves_matplotlibs_own_settings_alone():
 
 
 def test_the_least_depletion_carries_the_dot(figures):
-    dot = figures["fig8"].axes[0].lines[1]
+    dot = figures["fig8"].axes[0].lines[2]
     assert list(dot.get_xdata()) == [3.0]
 
 
 def test_both_of_two_symmetric_optima_are_marked():
     power = np.linspace(0.0, 10.0, 11)
     double = f.Curve("", power, ((power - 2.0) * (power - 8.0)) ** 2)
-    dots = f.depletion_over_split([double]).axes[0].lines[1]
+    dots = f.depletion_over_split([double]).axes[0].lines[2]
     assert len(dots.get_xdata()) == 2
 
 
 def test_a_split_that_cannot_be_driven_is_a_gap_without_a_dot():
     nothing = f.Curve("", [0.0, 1.0], [np.nan, np.nan])
-    assert len(f.depletion_over_split([nothing]).axes[0].lines) == 1
+    assert len(f.depletion_over_split([nothing]).axes[0].lines) == 2
+
+
+def test_the_ends_where_an_axle_rests_are_rings_and_no_part_of_the_line():
+    jumps = f.Curve("", [0.0, 1e-6, 500.0, 999.0, 1000.0], [1.0, 3.0, 2.0, 3.0, 1.0])
+    line, rings, dots = f.depletion_over_split([jumps]).axes[0].lines
+    assert list(line.get_ydata()) == [3.0, 2.0, 3.0]
+    assert list(rings.get_xdata()) == list(dots.get_xdata()) == [0.0, 1.0]
 
 
 def test_powers_are_drawn_in_kilowatts_inside_the_window(figures):

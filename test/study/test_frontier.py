@@ -71,6 +71,16 @@ def test_what_ours_saves_is_said_by_kind_of_cell():
     assert unseen.to_json(found)["kinds"][-1]["name"] == "all"
 
 
+def test_a_report_says_what_its_cells_were_made_with():
+    ours = [point(0.3, 5.0)._replace(policy=name) for name in ("coupled 1a", "coupled 2b", "coupled 3c")]
+    labels = ("mine, cycle 1, friction 0.9", "mine, cycle 1, friction 0.5", "car 7, cycle 1, friction 0.5")
+    text = unseen.report([Frontier(label, MADE, (), (o,), ()) for label, o in zip(labels, ours, strict=True)])
+    assert (
+        "idle drive drag, control at 100 Hz, split decided every 0.02 s; "
+        "policies: coupled 1a, coupled 2b, 1 of drawn cars, each solved for its own\n"
+    ) in text
+
+
 def test_cells_are_drawn_from_seeds_with_and_without_noise():
     cells = unseen.cells("jalalmaab_2015", "drag", 1000, 2, 1)
     assert len(cells) == 2 * (2 + 3) and len(set(cells)) == len(cells)

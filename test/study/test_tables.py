@@ -9,13 +9,14 @@ from iwm_sim.study.rows import Place, Row
 from iwm_sim.study.tables import markdown_table, plain_table, text_table
 
 METRICS = Metrics(**dict.fromkeys(Metrics._fields, 0.0))._replace(wh_per_km=104.456, trace_held=True)
-ROW = Row(Place("nycc", 0.9, "none"), "sdp", "sdp", METRICS, -1.456, None, True)
+MADE = {"dt_s": 0.01, "settings": {"decision_period_s": 0.02}}
+ROW = Row(Place("nycc", 0.9, "none"), "sdp", "sdp", METRICS, -1.456, None, True, MADE)
 
 
 def test_each_group_has_its_heading_once():
     rows = [ROW, replace(ROW, label="equal"), replace(ROW, place=Place("nycc", 0.2, "none"))]
     text = text_table(rows)
-    assert text.count("nycc, friction 0.9, idle drive none") == 1
+    assert text.count("nycc, friction 0.9, idle drive none, control at 100 Hz") == 1
     assert text.count("nycc, friction 0.2, idle drive none") == 1
     assert "104.46" in text
     assert "−1.46" in text

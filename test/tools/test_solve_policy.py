@@ -281,7 +281,7 @@ def test_thin_and_missing_data_is_warned_about(tmp_path, grid, capsys):
 def test_a_mistake_gives_one_line_and_code_2(arguments, words, grid, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("")
-    if "--grid" not in arguments:
+    if not {"--grid", "--check"}.intersection(arguments):
         arguments = ["--grid", grid, *arguments]
     assert _run("--vehicle", "jalalmaab_2015", *arguments) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
