@@ -143,6 +143,7 @@ def load_cycle(path: Path | str) -> Cycle:
     found = trace_units.implausible(columns["time_s"], columns["speed_mps"])
     if found:
         at, words = found
+        words += trace_units.hint(columns["time_s"], columns["speed_mps"])
         raise ConfigError(path, places[at] if at >= 0 else "", f"speed_mps {words}")
     _check_duration(path, places, columns["time_s"])
     return Cycle(

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iwm_power_manager.cycle import MAX_GRADE, MAX_SAMPLES, Cycle, at_rest, make_cycle
 from iwm_power_manager.errors import ConfigError
@@ -21,20 +22,25 @@ GAPS = ("refuse", "bridge", "cut")
 #: At a cut, the speed goes from one piece's end to the next one's start at this, m/s2.
 JOINT_MPS2 = 1.0
 _SHORTEST_STEP_S = 1e-4
+_DAY_S = 86_400.0
+#: A log of which more rows than this lie behind others in time was set back, or holds several drives.
+_MOST_BEHIND = 0.1
 #: A log that shows more than this below zero drives backwards, or has another sign.
 _BACKWARDS_MPS = 0.5
 _UNIT_NAMES = {
-    "km/h": r"km\W?/?h|kph|kmh",
-    "mph": r"mph|mi/h",
-    "kn": r"\bkn\b|knot",
+    "km/h": r"km[\W_]?/?p?h|kph",
+    "mph": r"(?<![a-z])mph|mi/h",
+    "kn": r"(?<![a-z])(kn|kts?)(?![a-z])|knot",
     "cm/s": r"cm/s|cmps",
-    "m/s": r"m/s|mps|m\W?s-1",
+    "ft/s": r"ft/s|fps",
+    "m/s": r"(?<![a-z])m[/_]?s(?![a-z])|(?<![a-z])mps|(?<![a-z])m\W?s-1",
 }
 _TIME_NAMES = {
-    "ns": r"\bns\b|_ns",
-    "us": r"\bus\b|_us|µs",
-    "ms": r"\bms\b|_ms|milli",
-    "min": r"\bmin\b|minutes",
+    "ns": r"\bns\b|_ns|nsec|nanos",
+    "us": r"\bus\b|_us|µs|usec|micros",
+    "ms": r"\bms\b|_ms|msec|milli",
+    "min": r"(?<![a-z])min\b|minutes",
+    "h": r"(?<![a-z])h\b|hours",
     "s": r"\[s\]|\(s\)|_s\b|sec",
 }
 
@@ -110,7 +116,7 @@ def read_log(
     line, header = table.rows[0]
     columns = {
         "time": _column(table, header, "time", time, r"time|stamp|\bt(?![a-z0-9])|zeit"),
-        "speed": _column(table, header, "speed", speed, r"speed|veloc|\bv(?![a-z0-9])|geschw|vitesse"),
+        "speed": _column(table, header, "speed", speed, r"speed|veloc|\bv(?![a-z0-9])|geschw|vitesse", _UNIT_NAMES),
     }
     if grade:
         columns["grade"] = _column(table, header, "grade", grade, "")
@@ -140,10 +146,7 @@ def read_log(
     if left_out:
         said.append(f"{left_out} rows without a value left out")
     if arrays["time"].size:
-        before = np.maximum.accumulate(arrays["time"])
-        rising = np.concatenate(([True], arrays["time"][1:] > before[:-1]))
-        if not np.all(rising):
-            said.append(f"{int(np.count_nonzero(~rising))} rows whose time does not rise left out")
+        rising = _rising(path, arrays["time"], clock, said)
         arrays = {name: x[rising] for name, x in arrays.items()}
     if arrays["time"].size < 2:
         raise ConfigError(path, "", f"has {arrays['time'].size} usable rows", "two or more")
@@ -153,8 +156,30 @@ def read_log(
     return _in_si(path, arrays, header, columns, "clock" if clock else time_unit, speed_unit, said)
 
 
-def _column(table: Table, header: list[str], what: str, name: str, pattern: str) -> int:
+def _rising(path: Path | str, time: FloatArray, clock: bool, said: list[str]) -> NDArray[np.bool_]:
+    """Which rows have a later time than all before them; a clock that passes midnight goes on (in place)."""
+    back = np.diff(time)
+    if clock and np.max(time) < _DAY_S and np.any(back < -0.5 * _DAY_S):
+        said.append("the clock passes midnight")
+        time[1:] += _DAY_S * np.cumsum(back < -0.5 * _DAY_S)
+    before = np.maximum.accumulate(time)[:-1]
+    rising: NDArray[np.bool_] = np.concatenate(([True], time[1:] > before))
+    behind = np.flatnonzero(time[1:] < before)
+    if behind.size > _MOST_BEHIND * time.size:
+        at = behind[0]
+        problem = f"its time falls from {before[at]:.12g} to {time[at + 1]:.12g}, and {behind.size} rows lie behind"
+        raise ConfigError(path, "", problem, "rows in the order of time, one drive")
+    if not np.all(rising):
+        said.append(f"{int(np.count_nonzero(~rising))} rows whose time does not rise left out")
+    return rising
+
+
+def _column(
+    table: Table, header: list[str], what: str, name: str, pattern: str, units: dict[str, str] | None = None
+) -> int:
+    """Index of a column: the one that is named, else the first that looks like it, rather one that names a unit."""
     wanted = [i for i, cell in enumerate(header) if (cell == name if name else re.search(pattern, cell, re.IGNORECASE))]
+    wanted.sort(key=lambda i: not _named(header[i], units or {}))
     if not wanted:
         problem = f"has no column {name!r}" if name else f"has no column that looks like {what}: name it with --{what}"
         raise ConfigError(table.path, "line 1", problem, ", ".join(header))
@@ -208,7 +233,8 @@ def _in_si(
         known_speed = SPEED_UNITS.get(units["speed"], 1.0) if units["speed"] != "auto" else 1.0
         found = likely_units(time * known_time, np.maximum(speed * known_speed, 0.0))
         if found is None:
-            raise ConfigError(path, "", f"its {' and '.join(guess)} look like driving in no unit", "name the unit")
+            look = f"{' and '.join(guess)} look{'s' * (len(guess) == 1)}"
+            raise ConfigError(path, "", f"its {look} like driving in no unit", "name the unit")
         for name, unit in zip(("speed", "time"), found, strict=True):
             if name in guess:
                 units[name] = unit

@@ -121,8 +121,9 @@ def _cell(path: Path | str, line: int, column: str, text: str) -> float:
         value = files.to_number(text)
     except ValueError as error:
         raise ConfigError(path, where, str(error), f"{low:g} to {high:g}") from None
-    if column == "efficiency" and 1.0 < value <= 100.0:
-        raise ConfigError(path, where, f"{value:g} is out of range: in percent? import_motor reads that", "0 to 1")
+    if column == "efficiency" and 1.0 < value < math.inf:
+        meant = "in percent? import_motor reads that" if value <= 100.0 else "a loss in W? import_motor --quantity loss"
+        raise ConfigError(path, where, f"{value:g} is out of range: {meant}", "0 to 1")
     return files.check_number(path, where, value, low, high)
 
 
@@ -144,7 +145,7 @@ def map_of(path: Path | str, efficiency: dict[tuple[float, float], float]) -> Mo
         elif power < 0.0 and (eta > 0.0 or _brakes_harder(efficiency, s, t, torques)):
             loss[row[s], column[t]] = -power * (1.0 - eta)
     if np.all(np.isnan(loss)):
-        raise ConfigError(path, "", "has no point with speed and torque above zero")
+        raise ConfigError(path, "", "has no efficiency above 0 where speed and torque are not 0")
     return MotorMap(speeds, torques, loss)
 
 

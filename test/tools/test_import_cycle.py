@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.import_cycle import main
+from iwm_power_manager.trace_units import SPEED_UNITS
 
 NYCC = load_cycle(share_path("config/cycles/nycc.csv"))
 
@@ -88,6 +90,49 @@ def test_a_gap_is_bridged_or_cut_by_choice_and_never_in_silence(tmp_path, capsys
     assert "1 gap of up to 52 s bridged (--max-gap)" in out
 
 
+@pytest.mark.parametrize(
+    ("speed", "unit", "time", "seconds"),
+    [
+        ("v_kmph", "km/h", "time_s", 1.0),
+        ("speed km_h", "km/h", "t [s]", 1.0),
+        ("speed_kn", "kn", "time (msec)", 1e-3),
+        ("SOG [kts]", "kn", "time_h", 3600.0),
+        ("speed_fps", "ft/s", "time_min", 60.0),
+        ("v_m_s", "m/s", "stamp_usec", 1e-6),
+    ],
+)
+def test_units_are_known_by_what_people_call_them(tmp_path, capsys, speed, unit, time, seconds):
+    scaled = zip(NYCC.time_s / seconds, NYCC.speed_mps / SPEED_UNITS[unit], strict=True)
+    log = log_of(tmp_path / "log.csv", (time, "v_batt", speed), [(t, 350.0, v) for t, v in scaled])
+    code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv", "--speed", speed)
+    assert code == 0
+    assert f"speed in {unit}, as the column's name says" in out
+    assert load_cycle(tmp_path / "trip.csv").distance_m == pytest.approx(NYCC.distance_m, rel=1e-6)
+    assert load_cycle(tmp_path / "trip.csv").duration_s == pytest.approx(NYCC.duration_s, rel=1e-6)
+
+
+def test_of_columns_that_look_like_speed_the_one_with_a_unit_is_taken(tmp_path, capsys):
+    rows = [(t, 350.0, 3.6 * v) for t, v in zip(NYCC.time_s, NYCC.speed_mps, strict=True)]
+    log = log_of(tmp_path / "log.csv", ("time_s", "v_batt", "speed_kmh"), rows)
+    _, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv")
+    assert "speed is 'speed_kmh'" in out
+
+
+def test_a_clock_that_passes_midnight_goes_on_and_one_set_back_is_refused(tmp_path, capsys):
+    start = datetime.datetime(2024, 5, 1, 23, 55)
+    clocks = [(start + datetime.timedelta(seconds=t)).strftime("%H:%M:%S") for t in NYCC.time_s]
+    log = log_of(tmp_path / "log.csv", ("time", "v [m/s]"), zip(clocks, NYCC.speed_mps, strict=True))
+    _, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv")
+    assert "the clock passes midnight" in out
+    assert load_cycle(tmp_path / "trip.csv").duration_s == NYCC.duration_s
+    back = np.where(NYCC.time_s < 300, NYCC.time_s, NYCC.time_s - 300)
+    log = log_of(tmp_path / "set_back.csv", ("time_s", "v [m/s]"), zip(back, NYCC.speed_mps, strict=True))
+    code, _, err = run(capsys, log, "--output", tmp_path / "other.csv")
+    assert code == 2
+    assert "its time falls from 299 to 0, and 299 rows lie behind; allowed: rows in the order of time" in err
+    assert not (tmp_path / "other.csv").exists()
+
+
 def test_a_unit_that_overrules_the_columns_name_is_said(tmp_path, capsys):
     log = log_of(tmp_path / "log.csv", ("time_s", "v [km/h]"), zip(NYCC.time_s, NYCC.speed_mps, strict=True))
     code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv", "--speed-unit", "m/s")
@@ -133,6 +178,8 @@ def test_a_trace_the_car_cannot_follow_is_warned_of(tmp_path, capsys):
         ("time_s,speed m/s\n0,0\n1,fast\n", "line 3, speed m/s: 'fast' is no number"),
         ("time_s,speed m/s\n0,0\n1,-9\n", "driving backwards is no cycle"),
         ("time_s,speed m/s\n0,0\n1,60\n", "no car does"),
+        ("time,speed_kmh\n" + "".join(f"{t},50\n" for t in range(20)), "its time looks like driving in no unit"),
+        ("time_s,speed m/s\n0,6\n0.1,0\n0.2,9\n1,9\n", "jumps by 9 m/s from one sample to the next"),
         ("time,speed\n0,0\n1,1e9\n", "look like driving in no unit"),
         ("time clock,speed m/s\n12:00:00,1\nlater,2\n", "'later' is no time"),
         ("time_s,speed m/s\n0," + "1" * 5000 + "\n", "has 5002 characters"),

@@ -109,7 +109,7 @@ def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys)
             (),
             "is no number (taken for a matrix, as it has 4 columns); allowed: for a list three columns: speed, torque",
         ),
-        ("w,t,eta\n1,2,nan\n2,3,nan\n", (), "has no point with speed and torque above zero"),
+        ("w,t,eta\n1,2,nan\n2,3,nan\n", (), "has no efficiency above 0 where speed and torque are not 0"),
     ],
 )
 def test_what_cannot_be_used_is_one_line_and_nothing_is_written(tmp_path, capsys, text, options, words):
