@@ -15,13 +15,13 @@ import numpy as np
 from iwm_power_manager.files import read_text
 from iwm_sim.study.ablation import Ablated
 from iwm_sim.study.battery_fit import Estimate
-from iwm_sim.study.cases import Case, cycle_of
 from iwm_sim.study.criteria import Criterion
+from iwm_sim.study.frontier import Frontier
 from iwm_sim.study.paper import Consequences
-from iwm_sim.study.rows import Row, policy_text
+from iwm_sim.study.rows import Row
 from iwm_sim.study.skid import Stopped
 
-FORMAT = 2
+FORMAT = 3
 
 
 @dataclass(frozen=True)
@@ -35,34 +35,6 @@ class PolicyIdentity:
     checksum: str
     switching_cost_j: float
     switching_fixed_cost_j: float
-
-
-@dataclass(frozen=True)
-class FrontierPoint:
-    """What a strategy saves at a price of a change, and how often it changes the share."""
-
-    family: str
-    price: str
-    saving_percent: float | None
-    share_changes_per_min: float
-    policy: str = ""
-
-
-@dataclass(frozen=True)
-class Frontier:
-    """Saving against changes of the share, along the price of a change; how it was driven, as a reader is told it."""
-
-    cycle: str
-    friction: float
-    points: list[FrontierPoint]
-    dt_s: float = 0.01
-    decision_period_s: float = 0.02
-
-    @property
-    def place(self) -> str:
-        """Where and how it was driven."""
-        law = f"control at {1.0 / self.dt_s:g} Hz, split decided every {self.decision_period_s:g} s"
-        return f"{self.cycle}, friction {self.friction:g}, idle drive none, {law}"
 
 
 @dataclass(frozen=True)
@@ -119,7 +91,6 @@ class Study:
     def from_json(cls, text: str | bytes) -> Study:
         """A study as `to_json` gave it."""
         values = json.loads(text)
-        frontier = values["frontier"]
         return cls(
             **values
             | {
@@ -130,7 +101,7 @@ class Study:
                 "cells": [Row.from_json(row) for row in values["cells"]],
                 "gates": [Row.from_json(row) for row in values["gates"]],
                 "stops": [Stopped(**stop) for stop in values["stops"]],
-                "frontier": Frontier(**frontier | {"points": [FrontierPoint(**point) for point in frontier["points"]]}),
+                "frontier": Frontier.from_json(values["frontier"]),
                 "robustness": [Robustness(**row) for row in values["robustness"]],
                 "battery_fit": {name: Estimate(**made) for name, made in values["battery_fit"].items()},
                 "paper": Consequences(**values["paper"]),
@@ -166,14 +137,3 @@ def rounded(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(f"{value:.6g}") if np.isfinite(value) else None
     return value
-
-
-def frontier_of(base: Case, rows: Sequence[Row]) -> Frontier:
-    """The frontier of `plan.frontier`'s rows."""
-    points = []
-    for row in rows:
-        family, price = row.label.split("|")
-        made = (row.saving_percent, row.metrics.share_changes_per_min, policy_text(row))
-        points.append(FrontierPoint(family, price, *made))
-    period_s = base.settings.decision_period_s
-    return Frontier(cycle_of(base.cycle).name, base.friction, points, base.dt_s, period_s)

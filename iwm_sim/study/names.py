@@ -22,8 +22,7 @@ FIGURES: dict[str, frozenset[str]] = {
     **dict.fromkeys(("7", "8", "9", "10", "12"), frozenset()),
     "13": frozenset({"--jobs"}),
     **dict.fromkeys(("14", "15"), frozenset({"--policy", "--jobs"})),
-    "transitions": frozenset(),
-    "frontier": frozenset({"--policy", "--jobs"}),
+    **dict.fromkeys(("transitions", "frontier"), frozenset()),
 }
 
 #: Figures of the paper that show no result, and what they show.

@@ -17,7 +17,9 @@ from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.cluster import on_all_cores
 from iwm_sim.study import cases, labels, paper, skid
 from iwm_sim.study.cases import Case, Change, Rule, SensorNoise
+from iwm_sim.study.frontier import Frontier, Place
 from iwm_sim.study.policies import PolicySource, solved
+from iwm_sim.study.unseen import budgets_of
 from iwm_sim.study.variants import VARIANTS
 
 IDLE_DRIVES = ("none", "drag")
@@ -27,11 +29,9 @@ STRATEGY = "sdp_lookahead"
 #: Power a change has to save, W, of the strongest rival in the tables.
 RIVAL_SWITCHING_W = (40.0, 60.0, 100.0)
 
-#: The switching frontier: cycle and road, and the prices along it.
+#: The frontier: cycle and road, and our budgets of changes a minute; the last one is as good as none.
 FRONTIER_CYCLE, FRONTIER_FRICTION = "udds", 0.9
-FRONTIER_POWERS_W = (0.0, 15.0, 30.0, 60.0, 100.0, 200.0, 400.0)
-FRONTIER_COSTS_J = (0.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
-FRONTIER_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+FRONTIER_BUDGETS_PER_MIN = (2.0, 4.0, 8.0, 14.0, 1000.0)
 
 ROBUSTNESS_CYCLES = ("hwfet", "udds")
 
@@ -87,25 +87,6 @@ class Policies:
             self.used[key] = solved(self.car(idle_drive), friction, VARIANTS[name].grid, self._say)
         return self.used[key]
 
-    def priced(self, folder: Path) -> dict[float, str]:
-        """Our policy solved for other prices of a change, by price in J; the problems go to a folder."""
-        at_hand = self.ours(IDLE_DRIVES[0], FRONTIER_FRICTION)
-        problem = cases.policy_of(at_hand).problem
-        made = {}
-        for factor in FRONTIER_FACTORS:
-            price = factor * max(problem.switching_fixed_cost_j, problem.switching_cost_j)
-            settings = {
-                "switching_cost_j": factor * problem.switching_cost_j,
-                "switching_fixed_cost_j": factor * problem.switching_fixed_cost_j,
-                "changes_per_min": problem.changes_per_min / factor,
-            }
-            grid = grid_file(folder, f"price_{price:g}_j", problem, settings)
-            other = factor != 1.0
-            made[price] = (
-                solved(self.car(IDLE_DRIVES[0]), FRONTIER_FRICTION, str(grid), self._say) if other else at_hand
-            )
-        return made
-
 
 def grid_file(folder: Path, name: str, problem: Problem, settings: Mapping[str, Any]) -> Path:
     """A grid's file: that of a problem with some of its settings replaced."""
@@ -122,13 +103,12 @@ class Plan:
 
     cells: list[Case] = field(default_factory=list)
     gates: list[Case] = field(default_factory=list)
-    frontier: list[Case] = field(default_factory=list)
     robustness: list[tuple[str, Case]] = field(default_factory=list)
 
     @property
     def cases(self) -> list[Case]:
         """All of them, in this order."""
-        return [*self.cells, *self.gates, *self.frontier, *(case for _, case in self.robustness)]
+        return [*self.cells, *self.gates, *(case for _, case in self.robustness)]
 
 
 def keys() -> list[Key]:
@@ -142,7 +122,7 @@ def fitted_rules(vehicle: str, wanted: Sequence[Key], jobs: int) -> dict[Key, Ru
     return dict(zip(wanted, on_all_cores(cases.fitted_rule, over, jobs), strict=True))
 
 
-def whole(policies: Policies, cycles: Sequence[str], rules: Mapping[Key, Rule], priced: Mapping[float, str]) -> Plan:
+def whole(policies: Policies, cycles: Sequence[str], rules: Mapping[Key, Rule]) -> Plan:
     """All that a study drives, the longest cycles first."""
     plan = Plan()
     for cycle in sorted(cycles, key=lambda name: -cases.cycle_of(name).duration_s):
@@ -152,8 +132,6 @@ def whole(policies: Policies, cycles: Sequence[str], rules: Mapping[Key, Rule], 
             base = Case(cycle, policies.vehicle, *key, "equal")
             plan.cells.extend(cell(base, policies, rules[key].coefficients, keep))
             plan.gates.extend(gates(base, policies, keep))
-    base = Case(among(FRONTIER_CYCLE, cycles), policies.vehicle, IDLE_DRIVES[0], FRONTIER_FRICTION, "equal")
-    plan.frontier.extend(frontier(base, priced))
     for idle_drive in IDLE_DRIVES:
         for cycle in dict.fromkeys(among(name, cycles) for name in ROBUSTNESS_CYCLES):
             plan.robustness.extend(robustness(Case(cycle, policies.vehicle, idle_drive, 0.9, "equal"), policies))
@@ -200,17 +178,10 @@ def gates(base: Case, policies: Policies, keep: tuple[str, ...] = ()) -> list[Ca
     return [replace(case, keep=keep) for case in made]
 
 
-def frontier(base: Case, priced: Mapping[float, str]) -> list[Case]:
-    """Saving against share changes: what the price of a change does, for each strategy that has one."""
-    rival = [_rival(base, f"instantaneous_slip|{power:g} W", power) for power in FRONTIER_POWERS_W]
-    bound = [
-        replace(base, strategy="preview", label=f"preview|{cost:g} J", switching_cost_j=cost)
-        for cost in FRONTIER_COSTS_J
-    ]
-    ours = [
-        replace(base, strategy=STRATEGY, label=f"ours|{price:.3g} J", policy=policy) for price, policy in priced.items()
-    ]
-    return [replace(base, label="ED|"), *rival, *bound, *ours]
+def frontier_on(cycle: str, vehicle: str) -> Frontier:
+    """Saving against changes of the split of every strategy that weighs them, and what could be saved."""
+    car, trace = cases.vehicle_of(vehicle, IDLE_DRIVES[0]), cases.cycle_of(cycle)
+    return budgets_of(Place(trace.name, car, trace, FRONTIER_FRICTION), FRONTIER_BUDGETS_PER_MIN)
 
 
 def robustness(base: Case, policies: Policies) -> list[tuple[str, Case]]:

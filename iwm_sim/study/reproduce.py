@@ -28,9 +28,22 @@ from iwm_power_manager.vehicle import pack_energy_wh
 from iwm_sim.cluster import on_all_cores
 from iwm_sim.study import ablation, battery_fit, cases, criteria, labels, pages, paper, sensitivity, skid
 from iwm_sim.study.cases import Case, Result
-from iwm_sim.study.content import PolicyIdentity, Robustness, Study, frontier_of
+from iwm_sim.study.content import PolicyIdentity, Robustness, Study
 from iwm_sim.study.driving import silent, tell, warm_up
-from iwm_sim.study.plan import IDLE_DRIVES, STRATEGY, Plan, Policies, among, fitted_rules, keys, stops, whole
+from iwm_sim.study.frontier import Frontier
+from iwm_sim.study.plan import (
+    FRONTIER_CYCLE,
+    IDLE_DRIVES,
+    STRATEGY,
+    Plan,
+    Policies,
+    among,
+    fitted_rules,
+    frontier_on,
+    keys,
+    stops,
+    whole,
+)
 from iwm_sim.study.rows import Row, rows_of
 from iwm_sim.study.study_figures import Material, convergence_of, drawn, window_of
 from iwm_sim.study.variants import VARIANTS
@@ -71,28 +84,28 @@ def study(
     for name in VARIANTS:
         for key in keys():
             policies.of_variant(name, *key)
-    priced = policies.priced(output / "grids")
     warm_up(_warming(policies, cycles[0]), say)
     with Bar(1, "runs", quiet=quiet) as bar:
         rules = fitted_rules(vehicle, keys(), jobs)
-        plan = whole(policies, cycles, rules, priced)
-        tasks: list[Callable[[], Any]] = [functools.partial(cases.result, case) for case in plan.cases]
+        plan = whole(policies, cycles, rules)
+        tasks: list[Callable[[], Any]] = [functools.partial(frontier_on, among(FRONTIER_CYCLE, cycles), vehicle)]
         tasks += [functools.partial(battery_fit.fit, vehicle, IDLE_DRIVES[0], _fit_cycles(cycles))]
         tasks += [functools.partial(_all_stops, stops(policies))]
+        tasks += [functools.partial(cases.result, case) for case in plan.cases]
         bar.total = len(tasks)
         bar.refresh()
-        made = on_all_cores(operator.call, tasks, jobs, lambda _: bar.update())
+        frontier, battery, stopped, *results = on_all_cores(operator.call, tasks, jobs, lambda _: bar.update())
     places = tuple((among(cycle, cycles), friction) for cycle, friction in ablation.PLACES)
     ablated = ablation.ablation(policies, output / "grids", jobs, say, tuple(dict.fromkeys(places)))
-    stored = _study(policies, plan, made[:-2], made[-2], made[-1], ablated).to_json()
+    stored = _study(policies, plan, results, frontier, battery, stopped, ablated).to_json()
     content = Study.from_json(stored)  # its numbers are those that a reader of the file has
     key = (IDLE_DRIVES[0], paper.FRICTIONS[0])
     solved = cases.policy_of(policies.of_variant(labels.PAPER_SDP, *key))
     material = Material(
-        battery=made[-2],
+        battery=battery,
         rule=rules[key],
         convergence=convergence_of(solved),
-        window=window_of(made[:-2]),
+        window=window_of(results),
         chain=solved.chain,
     )
     pages.write(output, content, drawn(content.frontier, material, policies.car(IDLE_DRIVES[0]).params))
@@ -124,6 +137,7 @@ def _study(
     policies: Policies,
     plan: Plan,
     results: Sequence[Result],
+    frontier: Frontier,
     battery: battery_fit.Fit,
     stops: list[skid.Stopped],
     ablated: list[ablation.Ablated],
@@ -149,8 +163,8 @@ def _study(
         cells=rows,
         gates=gate_rows,
         stops=stops,
-        frontier=frontier_of(plan.frontier[0], rows_of(results[tables : tables + len(plan.frontier)])),
-        robustness=_robustness_rows([name for name, _ in plan.robustness], results[tables + len(plan.frontier) :]),
+        frontier=frontier,
+        robustness=_robustness_rows([name for name, _ in plan.robustness], results[tables:]),
         battery_fit=battery.estimates,
         sensitivity=_sensitivity(car.params),
         ablation=ablated,

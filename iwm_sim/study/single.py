@@ -3,19 +3,15 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from iwm_sim.study import battery_fit, cases, labels, paper
 from iwm_sim.study.cases import Case
-from iwm_sim.study.content import frontier_of
 from iwm_sim.study.driving import Progress, drive_all
 from iwm_sim.study.names import TABLES
 from iwm_sim.study.plan import (
     FRONTIER_CYCLE,
-    FRONTIER_FRICTION,
     IDLE_DRIVES,
     STRATEGY,
     WINDOW_CYCLE,
@@ -24,7 +20,7 @@ from iwm_sim.study.plan import (
     Policies,
     cell,
     fitted_rules,
-    frontier,
+    frontier_on,
     gates,
     variant,
 )
@@ -103,7 +99,4 @@ def figure(name: str, policies: Policies, jobs: int = 1) -> Drawn:
         ]
         made = drive_all([replace(case, keep=WINDOW_SIGNALS) for case in wanted], jobs)
         return window_figures(window_of(made))[int(name) - 14]
-    with tempfile.TemporaryDirectory(prefix="iwm-frontier-") as folder:
-        base = Case(FRONTIER_CYCLE, policies.vehicle, IDLE_DRIVES[0], FRONTIER_FRICTION, "equal")
-        wanted = frontier(base, policies.priced(Path(folder)))
-        return frontier_figure(frontier_of(wanted[0], rows_of(drive_all(wanted, jobs))))
+    return frontier_figure(frontier_on(FRONTIER_CYCLE, policies.vehicle))

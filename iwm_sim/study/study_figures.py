@@ -18,7 +18,8 @@ from iwm_power_manager.tools.command import made_with
 from iwm_sim.metrics import CRITICAL_SLIP
 from iwm_sim.study import battery_fit, figures, sensitivity
 from iwm_sim.study.cases import Result, Rule
-from iwm_sim.study.content import Frontier
+from iwm_sim.study.frontier import OURS as STRATEGY
+from iwm_sim.study.frontier import RIVAL, Frontier
 from iwm_sim.study.labels import ED, GATE_OFF, OURS
 from iwm_sim.study.study_tables import BATTERY, FRONTIER, PROGRAM, SENSITIVITY, TABLE_6, TABLES
 
@@ -27,6 +28,13 @@ FloatArray = npt.NDArray[np.float64]
 #: Of all figures, and of the paper's eq. 23.
 _IDLE = "idle drive none"
 _DRIVEN = made_with("0.2", "none", 100.0)
+#: Families of the frontier by strategy.
+_FAMILIES = {
+    RIVAL: f"{RIVAL}, thresholds",
+    "instantaneous": "instantaneous",
+    STRATEGY: "ours, budgets",
+    "preview": "known in advance",
+}
 #: When Figures 14 and 15 look.
 WINDOW_S = (345.0, 430.0)
 
@@ -184,16 +192,16 @@ def window_figures(window: dict[str, dict[str, FloatArray]]) -> list[Drawn]:
 def frontier_figure(frontier: Frontier) -> Drawn:
     """Saving over changes of the share."""
     families: dict[str, tuple[list[float], list[float]]] = {}
-    for point in frontier.points:
-        if point.family != ED and point.saving_percent is not None:
-            changes, saving = families.setdefault(point.family, ([], []))
-            changes.append(point.share_changes_per_min)
+    for point in sorted(frontier.points, key=lambda point: point.changes_per_min):
+        if point.held and point.saving_percent is not None:
+            changes, saving = families.setdefault(_FAMILIES[point.strategy], ([], []))
+            changes.append(point.changes_per_min)
             saving.append(point.saving_percent)
     return Drawn(
         "frontier",
         "What a change of the share is worth",
-        f"{frontier.place}: saving over changes of the share by more than 0.25, along the price of a change.",
-        figures.switching_frontier(families),
+        f"{frontier.label}, {frontier.made_with}: saving over changes of the share by more than 0.25.",
+        figures.switching_frontier({name: families[name] for name in _FAMILIES.values() if name in families}),
         FRONTIER,
     )
 

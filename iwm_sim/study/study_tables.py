@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from iwm_sim.study import ablation, battery_fit, paper
-from iwm_sim.study.content import FrontierPoint, PolicyIdentity, Robustness, Study
+from iwm_sim.study.content import PolicyIdentity, Robustness, Study
 from iwm_sim.study.criteria import Criterion
+from iwm_sim.study.frontier import POINT_COLUMNS
 from iwm_sim.study.labels import (
     BOUND,
     ED,
@@ -354,27 +355,18 @@ def stops_table(study: Study) -> TableOf:
     )
 
 
-def _policy_of_point(point: FrontierPoint) -> str:
-    return point.policy
-
-
 def frontier_table(study: Study) -> TableOf:
     """Saving against changes of the share."""
     frontier = study.frontier
-    columns: tuple[Column[FrontierPoint], ...] = (
-        Column("Strategy", lambda row: row.family),
-        Column("Price of a change", lambda row: row.price),
-        Column("Saving", lambda row: row.saving_percent, "%", 3),
-        Column("Changes of the share", lambda row: row.share_changes_per_min, "1/min", 1),
-        *([Column("Policy", _policy_of_point)] if any(point.policy for point in frontier.points) else ()),
-    )
     return TableOf(
         FRONTIER,
-        frontier.place,
-        columns,
-        [point for point in frontier.points if point.family != ED],
-        "The price of instantaneous_slip is the power a change has to save; that of preview and ours is a cost per "
-        "change. Ours: solved anew for each price.",
+        f"{frontier.label}, {frontier.made_with}",
+        POINT_COLUMNS,
+        frontier.points,
+        "instantaneous_slip changes the split only to save the power named; ours is solved anew for each budget of "
+        "changes a minute (1000: free). Preview is the bound: the most that is saved with no more changes than ours at "
+        "the same budget made, the whole drive known in advance. Moves: the sum of all changes, 1 being all the power.",
+        "evaluate --frontier runs/frontier --cycle udds --idle-drive none --budgets 2 4 8 14 1000",
     )
 
 

@@ -8,7 +8,6 @@ counting changes; cells whose trace was lost count as such and have no margin.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,17 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from iwm_power_manager import __version__
-from iwm_power_manager.cycle import load_cycle
-from iwm_power_manager.mdp.demand import chain_of, source_of
 from iwm_power_manager.policy import load_policy
-from iwm_power_manager.share import resolve
-from iwm_power_manager.solve import load_grid, solve_one
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.study import generate
 from iwm_sim.study.cases import drawn_car, vehicle_of
 from iwm_sim.study.frontier import COUNTS, Frontier, Place, margin, measure_frontier
 from iwm_sim.study.names import DEFAULT_GRID
-from iwm_sim.study.policies import TRAINING_CYCLES, PolicySource
+from iwm_sim.study.policies import PolicySource, solved
 from iwm_sim.study.report import Column
 from iwm_sim.study.tables import plain_table
 
@@ -94,16 +89,10 @@ def drive_cell(cell: Cell) -> Frontier:
     return measure_frontier(place, [policy])
 
 
-def budgets_of(place: Place, budgets: Sequence[float], folder: Path) -> Frontier:
-    """The rivals, and ours solved anew for each budget, on one place, with the bound of each."""
-    policies = []
-    for budget in budgets:
-        problem = dataclasses.replace(load_grid(DEFAULT_GRID, place.vehicle.params), changes_per_min=budget)
-        sources = [source_of(load_cycle(resolve(name)), problem, place.vehicle.params) for name in TRAINING_CYCLES]
-        chain = chain_of(problem, sources)
-        made = solve_one(problem, place.vehicle, place.friction, chain, sources, folder / f"{budget:g}.npz")
-        policies.append(made.policy)
-    return measure_frontier(place, policies, bounds=True)
+def budgets_of(place: Place, budgets: Sequence[float]) -> Frontier:
+    """The rivals, and ours solved for each budget, on one place, with the bound of each."""
+    found = (solved(place.vehicle, place.friction, DEFAULT_GRID, budget_per_min=budget) for budget in budgets)
+    return measure_frontier(place, list(map(load_policy, found)), bounds=True)
 
 
 class Verdict(NamedTuple):
@@ -234,14 +223,5 @@ def to_json(frontiers: Sequence[Frontier]) -> dict[str, Any]:
         "package_version": __version__,
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in judge(frontiers)],
         "kinds": [kind._asdict() for kind in kinds(frontiers)],
-        "cells": [
-            {
-                "label": f.label,
-                "made_with": f.made_with,
-                "rivals": [point._asdict() for point in f.rivals],
-                "ours": [point._asdict() for point in f.ours],
-                "bounds": [point._asdict() for point in f.bounds],
-            }
-            for f in frontiers
-        ],
+        "cells": [f.to_json() for f in frontiers],
     }

@@ -321,8 +321,7 @@ def _frontier(options: argparse.Namespace) -> None:
             cycle = cases.cycle_of(name)
             for friction in options.friction or [0.9]:
                 place = frontier.Place(f"{vehicle.name} on {cycle.name}", vehicle, cycle, friction)
-                with tempfile.TemporaryDirectory() as policies:
-                    found.append(unseen.budgets_of(place, options.budgets or frontier.BUDGETS_PER_MIN, Path(policies)))
+                found.append(unseen.budgets_of(place, options.budgets or frontier.BUDGETS_PER_MIN))
                 picture = folder / f"{vehicle.name}_{vehicle.idle_drive}_{cycle.name}_{round(friction * 100):03d}.svg"
                 frontier_figure.draw_frontier(found[-1], picture)
                 if not options.quiet:
@@ -332,8 +331,7 @@ def _frontier(options: argparse.Namespace) -> None:
 
 
 def _show_frontier(made: frontier.Frontier, picture: Path) -> None:
-    points = [*made.rivals, *made.ours, *made.bounds]
-    print(f"{made.label}, {made.made_with}\n{plain_table(points, frontier.POINT_COLUMNS)}")
+    print(f"{made.label}, {made.made_with}\n{plain_table(made.points, frontier.POINT_COLUMNS)}")
     print("moves/min: sum of all moves, 1 being all the power; preview: the bound, the whole drive known in advance")
     print(f"picture: {picture}\n")
 
