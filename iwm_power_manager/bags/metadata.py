@@ -162,7 +162,7 @@ def problem_with(information: Mapping[str, Any]) -> str:
             wanted.append(("a topic's message_count", entry["message_count"], int))
             wanted += [(f"a topic's {key}", entry["topic_metadata"][key], str) for key in _TOPIC_KEYS]
     except (AttributeError, TypeError, KeyError) as error:
-        return f"an entry ({error})"
+        return f"an entry ({error})" if isinstance(error, KeyError) else "an entry"
     return next((key for key, content, kind in wanted if not isinstance(content, kind)), "")
 
 

@@ -78,6 +78,7 @@ class BagReader:
         self._stack = ExitStack()
         self._damage: list[str] = []
         self.sources: list[Source] = []
+        self._opened: list[Path] = []
         try:
             self.information = self._information()
             self._open_all()
@@ -106,7 +107,11 @@ class BagReader:
     @property
     def damage(self) -> list[str]:
         """What could not be read so far, a line each; empty for a whole bag."""
-        return self._damage + [f"{source.path}: {line}" for source in self.sources for line in source.damage]
+        return self._damage + [
+            f"{name}: {line}"  # not a copy's
+            for name, source in zip(self._opened, self.sources, strict=True)
+            for line in source.damage
+        ]
 
     def messages(self) -> Iterator[Message]:
         """All messages in the order of their log times; equal times keep the order of the recording."""
@@ -175,6 +180,7 @@ class BagReader:
                 opened, problem = opened_file(name, self._stack, self.path if self.path != name else None)
                 self._damage += [f"{name}: {problem}"] if problem else []
                 self.sources.append(open_source(opened, name, self._stack))
+                self._opened.append(name)
             except BagError as error:
                 problems.append(str(error))
         if not self.sources:

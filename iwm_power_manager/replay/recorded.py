@@ -39,6 +39,8 @@ _PROBE_MESSAGES = 2000
 _STANDING = 10
 #: No clock is so many times slower than the one of the log; one that counts milliseconds is.
 _SLOW = 100
+#: A stamp this far from the one before belongs to a clock that was set in between, unless the log shows such a pause.
+_SET_NS = 86_400 * 10**9
 
 FloatArray = NDArray[np.float64]
 
@@ -190,12 +192,14 @@ class SignalStream:
 
 
 def _advance(times: Sequence[tuple[int, int]]) -> bool:
-    """Whether stamps go on, most of them forward, and not a hundred times slower than the log times beside them."""
+    """Whether stamps go on, most of them forward, by one clock that is not much slower than that of the log."""
     stamps = [stamp_ns for stamp_ns, _ in times]
-    forward = sum(after > before for before, after in itertools.pairwise(stamps))
-    backward = sum(after < before for before, after in itertools.pairwise(stamps))
+    steps = [after - before for before, after in itertools.pairwise(stamps)]
+    forward, backward = sum(step > 0 for step in steps), sum(step < 0 for step in steps)
     spans = [max(column) - min(column) for column in zip(*times, strict=True)]
-    return len(set(stamps)) * _STANDING >= len(stamps) and forward > backward and spans[0] * _SLOW >= spans[1]
+    one_clock = spans[0] * _SLOW >= spans[1] and max(map(abs, steps)) <= max(_SET_NS, spans[1])
+    stands = len(set(stamps)) * _STANDING < len(stamps) or stamps.count(0) * _STANDING > len(stamps) + _STANDING
+    return one_clock and forward > backward and not stands
 
 
 def _types(bag: BagReader, name: str) -> Types:

@@ -169,6 +169,7 @@ def test_a_truncated_compressed_file_is_read_as_far_as_it_goes(tmp_path: Path) -
         assert found == list(range(1000, 1000 + len(found)))
         assert len(found) > 1000
         assert reader.damage
+        assert all(line.startswith(f"{packed}: ") for line in reader.damage)
 
 
 def test_metadata_that_cannot_be_read_is_reported_and_the_files_read(make_bag: Callable[..., Path]) -> None:

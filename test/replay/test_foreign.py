@@ -97,8 +97,11 @@ def test_a_missing_nested_definition_is_one_line_with_topic_and_type(
         lambda _: 1_234_567_890,
         lambda log_ns: log_ns // 10**6,
         lambda log_ns: 2 * foreign.START_NS - log_ns,
+        lambda log_ns: log_ns * (log_ns >= foreign.START_NS + 10**9),
+        lambda log_ns: (log_ns - foreign.START_NS) * (log_ns >= foreign.START_NS + 10**9),
+        lambda log_ns: log_ns - foreign.START_NS * (log_ns < foreign.START_NS + 10**9),
     ],
-    ids=["zero", "standing", "milliseconds", "backwards"],
+    ids=["zero", "standing", "milliseconds", "backwards", "zero at first", "zero at first of 0 s", "set in between"],
 )
 def test_stamps_that_do_not_advance_are_said_once_and_log_times_are_used(
     tmp_path: Path, mapping: Path, stamp: Callable[[int], int], capsys: pytest.CaptureFixture[str]
