@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """One MCAP file being written by the `mcap` package, so that whatever happens to it, it ends with a whole record.
 
-The package's writer hands its bytes to a buffer, and from there they go into the file by unbuffered writes. So a chunk
-is in the file when `push` returns, which is what makes a killed recorder's bag recoverable, and a write that the disk
-refuses is cut off again. After that the package's writer is of no use: it has taken up what is not in the file. What is
-there stays readable without an index, and `recover` gives it one.
+The package's writer hands its bytes to this file, and they go to the disk by unbuffered writes. So a chunk is in the
+file when it is closed, which is what makes a killed recorder's bag recoverable, and a write that the disk refuses is
+cut off again. After that the package's writer is of no use: it has taken up what is not in the file. What is there
+stays readable without an index, and `recover` gives it one.
 
 rosbags' writer ends a chunk by its size alone, writes neither publish times nor sequence numbers, and one file
 (`McapWriter` in https://gitlab.com/ternaris/rosbags/-/blob/master/src/rosbags/rosbag2/storage_mcap.py).
@@ -16,13 +16,14 @@ import errno
 import os
 import struct
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, cast
 
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from iwm_power_manager.bags.mcap_records import MAGIC, walk
+from iwm_power_manager.bags.mcap_records import walk
 
 COMPRESSIONS = ("none", "lz4", "zstd")
 _SPAN = struct.Struct("<QQ")
@@ -30,27 +31,8 @@ _INDEX = struct.Struct("<HI")
 _INDEX_ENTRY_BYTES = 16
 
 
-class _Buffer:
-    """What the package's writer takes for a file: collects bytes, and knows where in the file they will stand."""
-
-    def __init__(self) -> None:
-        self.pieces: list[bytes] = []
-        self.offset = 0
-
-    def write(self, data: bytes) -> int:
-        self.pieces.append(data)
-        self.offset += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        return self.offset
-
-    def flush(self) -> None:
-        pass
-
-
 class McapFile:
-    """A new MCAP file, opened for writing.
+    """A new MCAP file, opened for writing; chunks are closed when they are large enough, and by `flush`.
 
     Parameters
     ----------
@@ -62,8 +44,7 @@ class McapFile:
 
     Attributes
     ----------
-    writer : the package's; after whatever was done with it, `push` brings what it has written into the file
-    pieces : what it has written since then
+    writer : the package's, which takes messages, definitions and metadata
     stream : the file itself, unbuffered
     size_bytes : what is in the file so far
     counts, start_time_ns, end_time_ns : messages by channel, and their log times, in the file; 0 while there are none
@@ -72,8 +53,8 @@ class McapFile:
     Raises
     ------
     OSError
-        From any method that writes. What is in the file then ends with a whole record: a half-written one is cut off.
-        Of the messages in memory nothing is left, what comes later is refused, and the file gets no index.
+        From whatever writes. What is in the file then ends with a whole record: a half-written one is cut off. Of the
+        messages in memory nothing is left, what comes later is refused, and the file gets no index.
     """
 
     def __init__(
@@ -91,17 +72,14 @@ class McapFile:
         self.end_time_ns = 0
         self.counts: Counter[int] = Counter()
         self.broken = False
+        self._chunk = b""
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
-        self._buffer = _Buffer()
-        self.pieces = self._buffer.pieces
-        # Chunks are closed by the writer when they are large enough, and by whoever calls `flush`, in time.
         self.writer = Writer(
-            cast("IO[bytes]", self._buffer), chunk_size=chunk_bytes, compression=CompressionType[compression.upper()]
+            cast("IO[bytes]", self), chunk_size=chunk_bytes, compression=CompressionType[compression.upper()]
         )
         self.stream: IO[bytes] = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by finish() or abandon()
-        self.writer.start(profile, library)
         try:
-            self.push()
+            self.writer.start(profile, library)
         except OSError:
             self.remove()
             raise
@@ -118,44 +96,35 @@ class McapFile:
             self._schema_ids[key] = self.writer.register_schema(name, encoding, data)
         return self._schema_ids[key]
 
-    def push(self) -> None:
-        """Bring what the writer has written into the file, and count it."""
+    def write(self, data: bytes) -> int:
+        """Take whole records; a chunk waits for the index of its messages, which comes next."""
         if self.broken:
             raise OSError(errno.EIO, "an earlier write has failed")
-        data = b"".join(self.pieces)
-        self.pieces.clear()
-        try:
-            if self.size_bytes and os.fstat(self.stream.fileno()).st_nlink == 0:
-                raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
-            self.append(data)
-        except OSError:
-            self.broken = True
-            raise
-        for record in walk(data, 0 if self.size_bytes > len(data) else len(MAGIC)):
-            if record.opcode == Opcode.CHUNK:
-                start_ns, end_ns = _SPAN.unpack_from(data, record.body)
-                self.start_time_ns = min(self.start_time_ns, start_ns) if self.counts else start_ns
-                self.end_time_ns = max(self.end_time_ns, end_ns)
-            elif record.opcode == Opcode.MESSAGE_INDEX:
-                channel, entries_bytes = _INDEX.unpack_from(data, record.body)
-                self.counts[channel] += entries_bytes // _INDEX_ENTRY_BYTES
+        if data[:1] == bytes([Opcode.CHUNK]):
+            self._chunk = data
+        elif data:
+            records, self._chunk = self._chunk + data, b""
+            try:
+                if self.size_bytes and os.fstat(self.stream.fileno()).st_nlink == 0:
+                    raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
+                self.append(records)
+            except OSError:
+                self.broken = True
+                raise
+            self._count(records)
+        return len(data)
 
-    def add_record(self, record: bytes) -> None:
-        """Write a record as it is, behind those before it; for kinds that are not in the index."""
-        self._buffer.write(record)
-        self.push()
+    def tell(self) -> int:
+        """Where the next record begins."""
+        return self.size_bytes + len(self._chunk)
 
     def flush(self) -> None:
-        """Write the chunk in memory, if it holds a message."""
-        self.writer.flush()
-        self.push()
+        """Nothing waits here; `writer.flush` closes the chunk in memory."""
 
     def finish(self, sync: bool = True) -> None:
         """Write the last chunk and the index, with `sync` wait until the disk has them, and close the file."""
         try:
-            self.flush()
             self.writer.finish()
-            self.push()
             if sync:
                 os.fsync(self.stream.fileno())
         finally:
@@ -178,13 +147,18 @@ class McapFile:
                 written = self.stream.write(view)
                 view = view[written or 0 :]
         except OSError:
-            self._cut()
+            with suppress(OSError):  # a reader that goes as far as it can stops at the torn record
+                self.stream.truncate(self.size_bytes)
+                self.stream.seek(self.size_bytes)
             raise
         self.size_bytes += len(data)
 
-    def _cut(self) -> None:
-        try:
-            self.stream.truncate(self.size_bytes)
-            self.stream.seek(self.size_bytes)
-        except OSError:
-            pass  # a reader that goes as far as it can stops at the torn record
+    def _count(self, records: bytes) -> None:
+        for record in walk(records, 0):
+            if record.opcode == Opcode.CHUNK:
+                start_ns, end_ns = _SPAN.unpack_from(records, record.body)
+                self.start_time_ns = min(self.start_time_ns, start_ns) if self.counts else start_ns
+                self.end_time_ns = max(self.end_time_ns, end_ns)
+            elif record.opcode == Opcode.MESSAGE_INDEX:
+                channel, entries_bytes = _INDEX.unpack_from(records, record.body)
+                self.counts[channel] += entries_bytes // _INDEX_ENTRY_BYTES

@@ -363,12 +363,11 @@ class _Copy:
             metadata: Metadata = read_record(Metadata, data, record)
             writer.add_metadata(metadata.name, metadata.metadata)
         elif record.opcode >= FIRST_PRIVATE:
-            self._file.add_record(data[record.start : record.end])
+            self._file.write(data[record.start : record.end])
         elif record.opcode == UNREADABLE and record.end < len(data):
             self.lost += 1
         elif record.opcode == UNREADABLE:
             self.torn = record.end - record.start
-        self._file.push()
 
     def _write(self, messages: Iterable[ChannelMessage]) -> None:
         writer = self._file.writer
@@ -376,8 +375,6 @@ class _Copy:
             if channel not in self._channels:  # its announcement is lost; what was sent on it is not
                 self._channels[channel] = writer.register_channel(f"/recovered/channel_{channel}", "cdr", 0, {})
             writer.add_message(self._channels[channel], log_time, data, publish_time, sequence)
-            if self._file.pieces:
-                self._file.push()
 
 
 def _missing(files: Iterable[_File]) -> dict[str, int]:

@@ -163,7 +163,6 @@ class BagWriter:
         self.custom_data.update(values)
         with self._failing():
             self._open.writer.add_metadata(CUSTOM_METADATA, dict(values))
-            self._open.push()
 
     def write(
         self, topic: int, log_time_ns: int, data: bytes, publish_time_ns: int | None = None, sequence: int = 0
@@ -175,16 +174,14 @@ class BagWriter:
     def write_all(self, samples: Iterator[Sample]) -> None:
         """Write messages. After `MessageTooLarge` the iterator stands behind the one that was refused."""
         watched = self._splits or self._file_start_ns is None
-        add, channels, pieces, largest = self._add, self._channels, self._pieces, self._largest
-        for topic, log_time_ns, data, publish_time_ns, sequence in samples:
-            if watched or len(data) > largest:
-                self._prepare(topic, log_time_ns, len(data))
-                watched = self._splits
-                add, channels, pieces = self._add, self._channels, self._pieces
-            add(channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
-            if pieces:  # a chunk is full
-                with self._failing():
-                    self._open.push()
+        add, channels, largest = self._add, self._channels, self._largest
+        with self._failing():
+            for topic, log_time_ns, data, publish_time_ns, sequence in samples:
+                if watched or len(data) > largest:
+                    self._prepare(topic, log_time_ns, len(data))
+                    watched = self._splits
+                    add, channels = self._add, self._channels
+                add(channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
 
     def _prepare(self, topic: int, log_time_ns: int, size: int) -> None:
         """Refuse a message that is too large; begin the next file, if the present one is full or old enough."""
@@ -208,7 +205,7 @@ class BagWriter:
     def flush(self) -> None:
         """Bring everything given so far into the file: it then survives this process."""
         with self._failing():
-            self._open.flush()
+            self._open.writer.flush()
 
     def sync(self, then: Callable[[], object]) -> None:
         """Have the disk take what is in the file, and call `then`; nothing is done while it is at earlier work."""
@@ -283,12 +280,11 @@ class BagWriter:
                 if self.custom_data:
                     file.writer.add_metadata(CUSTOM_METADATA, self.custom_data)
                 self._channels = [announce(file, topic) for topic in self._topics]
-                file.push()
             except OSError:
                 file.remove()
                 raise
         self._file, self._file_start_ns = file, None
-        self._add, self._pieces = file.writer.add_message, file.pieces
+        self._add = file.writer.add_message
 
     def _finish_file(self, file: McapFile) -> None:
         try:
@@ -328,15 +324,12 @@ def announce(file: McapFile, topic: Topic) -> int:
     schema = file.schema_id(topic.type, topic.encoding, definition) if definition else 0
     qos = yaml_text(qos_entries(topic.qos)) if topic.qos else ""
     metadata = {"offered_qos_profiles": qos, "topic_type_hash": topic.type_hash}
-    channel = file.writer.register_channel(topic.name, topic.serialization, schema, metadata)
-    if file.pieces:  # that has closed a chunk
-        file.push()
-    return channel
+    return file.writer.register_channel(topic.name, topic.serialization, schema, metadata)
 
 
 def finish(file: McapFile, channels: Sequence[tuple[Topic, int]], custom_data: Mapping[str, str]) -> None:
     """Complete a file with the metadata rosbag2 keeps inside, and close it; the disk may still have to take it."""
-    file.flush()
+    file.writer.flush()
     counts = [(topic, file.counts[channel]) for topic, channel in channels]
     information = bag_information("mcap", [span_of(file)], counts, custom_data)
     file.writer.add_metadata("rosbag2", {"serialized_metadata": yaml_text(information)})

@@ -20,7 +20,6 @@ def fill(path: Path, count: int, **options: object) -> McapFile:
     channels = [file.writer.register_channel(f"/t{i}", "cdr", schema, {"key": "value"}) for i in range(3)]
     for i in range(count):
         file.writer.add_message(channels[i % 3], 1000 + i, bytes([i % 256]) * (i % 50), 900 + i, i)
-    file.push()
     return file
 
 
@@ -76,7 +75,7 @@ def test_a_file_without_messages_is_valid(tmp_path: Path) -> None:
 def test_everything_flushed_is_readable_from_the_unfinished_file(tmp_path: Path) -> None:
     file = fill(tmp_path / "a.mcap", 500)
     assert file.message_count == 0
-    file.flush()
+    file.writer.flush()
     assert (file.message_count, file.start_time_ns, file.end_time_ns) == (500, 1000, 1499)
     with (tmp_path / "a.mcap").open("rb") as stream:
         count = 0
@@ -98,7 +97,7 @@ def test_a_half_written_chunk_is_cut_off_and_what_was_written_before_is_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = fill(tmp_path / "a.mcap", 100)
-    file.flush()
+    file.writer.flush()
     stream = file.stream
 
     class FullDisk:
@@ -121,11 +120,11 @@ def test_a_half_written_chunk_is_cut_off_and_what_was_written_before_is_whole(
     for i in range(100):
         file.writer.add_message(1, 5000 + i, bytes(range(100)), 0)
     with pytest.raises(OSError, match="No space left"):
-        file.flush()
+        file.writer.flush()
     monkeypatch.setattr(file, "stream", stream)
     assert (file.message_count, file.broken) == (100, True)
     with pytest.raises(OSError, match="an earlier write has failed"):
-        file.push()
+        file.writer.flush()
     file.abandon()
     assert (tmp_path / "a.mcap").stat().st_size == file.size_bytes
     report = recover(tmp_path / "a.mcap").files[0]
@@ -136,7 +135,7 @@ def test_a_file_removed_while_it_is_written_is_noticed_at_the_next_flush(tmp_pat
     file = fill(tmp_path / "a.mcap", 10)
     (tmp_path / "a.mcap").unlink()
     with pytest.raises(FileNotFoundError, match="removed"):
-        file.flush()
+        file.writer.flush()
     file.abandon()
 
 
@@ -145,9 +144,7 @@ def test_a_channel_that_closes_a_chunk_counts_no_message_that_is_still_in_memory
     channel = file.writer.register_channel("/a", "cdr", 0)
     file.writer.add_message(channel, 1, bytes(60), 1)
     other = file.writer.register_channel("/b" * 100, "cdr", 0)
-    file.push()
     assert file.counts == {channel: 1}
     file.writer.add_message(other, 2, b"", 2)
-    file.push()
     assert file.counts == {channel: 1}
     file.abandon()
