@@ -6,13 +6,15 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 #: Stamps one side may be ahead of the other before they count as having no counterpart.
 _WINDOW = 10_000
 
 
-class Difference(NamedTuple):
+@dataclass(frozen=True)
+class Difference:
     """One value that differs.
 
     Attributes
@@ -31,14 +33,14 @@ class Difference(NamedTuple):
     recomputed: float
 
 
-class TopicComparison(NamedTuple):
+@dataclass
+class TopicComparison:
     """Result for one topic.
 
     Attributes
     ----------
     topic : its name
-    compared : messages compared
-    differing : messages with at least one value beyond the tolerance
+    compared, differing : messages compared, and those with at least one value beyond the tolerance
     largest, rms : of all differences of values (infinite: one is NaN and the other is not)
     worst : name of the value with the largest difference
     first : first difference beyond the tolerance
@@ -46,14 +48,14 @@ class TopicComparison(NamedTuple):
     """
 
     topic: str
-    compared: int
-    differing: int
-    largest: float
-    rms: float
-    worst: str
-    first: Difference | None
-    only_recorded: int
-    only_recomputed: int
+    compared: int = 0
+    differing: int = 0
+    largest: float = 0.0
+    rms: float = 0.0
+    worst: str = ""
+    first: Difference | None = None
+    only_recorded: int = 0
+    only_recomputed: int = 0
 
     @property
     def has_record(self) -> bool:
@@ -72,18 +74,13 @@ class TopicComparer:
     """
 
     def __init__(self, topic: str, tolerance: float, younger: Collection[str] = ()) -> None:
-        self._topic = topic
+        self._found = TopicComparison(topic)
         self._younger = younger
         self._tolerance = tolerance
         self._waiting: tuple[OrderedDict[int, _Side], OrderedDict[int, _Side]] = (OrderedDict(), OrderedDict())
         self._unpaired = [0, 0]
-        self._compared = 0
-        self._differing = 0
         self._count = 0
         self._squares = 0.0
-        self._largest = 0.0
-        self._worst = ""
-        self._first: Difference | None = None
 
     def recorded(self, stamp_ns: int, log_time_ns: int, names: Sequence[str], values: Sequence[float]) -> None:
         """Add a recorded message."""
@@ -95,17 +92,11 @@ class TopicComparer:
 
     def result(self) -> TopicComparison:
         """What has been found so far."""
-        return TopicComparison(
-            self._topic,
-            self._compared,
-            self._differing,
-            self._largest,
-            math.sqrt(self._squares / self._count) if self._count else 0.0,
-            self._worst,
-            self._first,
-            self._unpaired[0] + len(self._waiting[0]),
-            self._unpaired[1] + len(self._waiting[1]),
+        recorded, recomputed = (
+            count + len(waiting) for count, waiting in zip(self._unpaired, self._waiting, strict=True)
         )
+        rms = math.sqrt(self._squares / self._count) if self._count else 0.0
+        return replace(self._found, rms=rms, only_recorded=recorded, only_recomputed=recomputed)
 
     def _add(self, side: int, stamp_ns: int, new: _Side) -> None:
         other = self._waiting[1 - side].pop(stamp_ns, None)
@@ -119,7 +110,8 @@ class TopicComparer:
             self._unpaired[side] += 1
 
     def _compare(self, stamp_ns: int, recorded: _Side, recomputed: _Side) -> None:
-        self._compared += 1
+        result = self._found
+        result.compared += 1
         self._count += len(recomputed.values)
         if recorded.names == recomputed.names and recorded.values == recomputed.values:
             return  # NaN is not equal to itself, and goes the long way
@@ -131,13 +123,12 @@ class TopicComparer:
             was = found.get(name, math.nan)
             difference = _distance(was, value)
             self._squares += difference * difference
-            if difference > self._largest:
-                self._largest, self._worst = difference, name
+            if difference > result.largest:
+                result.largest, result.worst = difference, name
             if difference > self._tolerance and beyond is None:
-                beyond = Difference(self._compared - 1, stamp_ns, recorded.log_time_ns, name, was, value)
-        if beyond is not None:
-            self._differing += 1
-            self._first = self._first or beyond
+                beyond = Difference(result.compared - 1, stamp_ns, recorded.log_time_ns, name, was, value)
+        result.differing += beyond is not None
+        result.first = result.first or beyond
 
 
 class _Side(NamedTuple):

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.model.parameters import VehicleParams
@@ -148,13 +148,17 @@ class SignalStream:
             for value in self.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns):
                 if value.stamped:
                     stamps.setdefault(message.topic, []).append((value.reading.stamp_ns, value.log_time_ns))
-        self.taken.clear()
-        self.bad.clear()
+        self.forget()
         standing = sorted(topic for topic, found in stamps.items() if len(found) > 2 and not _advance(found))
         if not standing:
             return ""
         self._by_stamp = False
         return f"the header stamps of {', '.join(standing)} do not advance: log times are used"
+
+    def forget(self) -> None:
+        """Count from nought."""
+        for counts in (self.taken, self.bad, self.without):
+            counts.clear()
 
     @property
     def topics(self) -> set[str]:
@@ -207,11 +211,17 @@ def _types(bag: BagReader, name: str) -> Types:
     topic = bag.topics[name]
     sample = b""
     if "wstring" in topic.definition:  # how wide its characters are, only a message tells
-        sample = next((message.data for message in bag.messages() if message.topic == name), b"")
+        first = first_message(bag, name)
+        sample = first.data if first else b""
     try:
         return types_of(topic.type, topic.encoding, topic.definition, sample)
     except BagError as error:
         raise BagError(f"{name}: {error}") from None
+
+
+def first_message(bag: BagReader, topic: str) -> Message | None:
+    """The first message of a topic; None if the bag holds none."""
+    return next((message for message in bag.messages() if message.topic == topic), None)
 
 
 def _usable(reading: Reading) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
 
 from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
 from iwm_power_manager.bags.reader import BagReader, Message
@@ -20,14 +20,14 @@ from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.replay.commands import RecordedCommand, command_topics, commands_elsewhere, torques_nm
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
 from iwm_power_manager.replay.plan import Plan
-from iwm_power_manager.replay.recorded import SignalStream, check_signals
+from iwm_power_manager.replay.recorded import SignalStream, check_signals, first_message
 from iwm_power_manager.replay.steps import ReconstructedSteps, RecordedSteps, ReplayedStep
 from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.commands import CommandWriter
 from iwm_power_manager.signals.contract import NODE_FRICTION
 from iwm_power_manager.signals.contract import POWER_MANAGER_STATE as STATE
 from iwm_power_manager.signals.mapping import JOINT_STATE, SignalMapping, topic_named
-from iwm_power_manager.signals.readings import NamedValues, joint_state_reader, joint_state_writer
+from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import definition_of
 
 #: How the state's topic ends, whatever its node is called.
@@ -47,15 +47,15 @@ _BATCH_MESSAGES = 2000
 _BATCH_BYTES = 16 * 1024 * 1024
 
 
-class ReplayReport(NamedTuple):
+@dataclass
+class ReplayReport:
     """What a replay did.
 
     Attributes
     ----------
     notes : what was done other than asked, a line each
     exact : steps were repeated from the recorded state; else made from the inputs
-    messages : read
-    steps : control steps taken
+    messages, steps : messages read, and control steps taken
     first_stamp_ns, last_stamp_ns : of the steps
     span_ns : driven: from each step to the next, jumps back left out
     gaps : times at which steps are missing in the record, so that the law's memory is unknown
@@ -71,20 +71,20 @@ class ReplayReport(NamedTuple):
 
     notes: list[str]
     exact: bool
-    messages: int
-    steps: int
-    first_stamp_ns: int
-    last_stamp_ns: int
-    span_ns: int
-    gaps: int
-    changed: int
-    restarts: int
-    bad_messages: int
-    dropped: dict[str, dict[str, int]]
-    faults: dict[str, int]
-    damage: list[str]
-    comparison: list[TopicComparison]
-    not_compared: list[str]
+    messages: int = 0
+    steps: int = 0
+    first_stamp_ns: int = 0
+    last_stamp_ns: int = 0
+    span_ns: int = 0
+    gaps: int = 0
+    changed: int = 0
+    restarts: int = 0
+    bad_messages: int = 0
+    dropped: dict[str, dict[str, int]] = field(default_factory=dict)
+    faults: dict[str, int] = field(default_factory=dict)
+    damage: list[str] = field(default_factory=list)
+    comparison: list[TopicComparison] = field(default_factory=list)
+    not_compared: list[str] = field(default_factory=list)
 
 
 class Replay:
@@ -104,84 +104,73 @@ class Replay:
 
     def __init__(self, bag: BagReader, plan: Plan, tolerance: float = 0.0) -> None:
         self._bag = bag
-        self._plan = plan
         state = state_topic(bag)
-        self._state_topic = _with_messages(bag, state)
-        self._recorded: RecordedSteps | None = None
-        self._reconstructed: ReconstructedSteps | None = None
-        self._stream: SignalStream | None = None
-        self._bad_messages = 0
-        self._notes = list(plan.notes)
-        self._messages = 0
-        self._steps = 0
-        self._stamps = (0, 0)
-        self._span_ns = 0
+        self._state_topic = state if state and first_message(bag, state) else None
+        self._report = ReplayReport([*plan.notes], exact=self._state_topic is not None)
         self._state_comparer = TopicComparer(state or STATE, tolerance, YOUNGER_SIGNALS)
         self._commands: dict[str, RecordedCommand] = {}
-        self._not_compared: list[str] = []
         self._find_commands(plan.mapping, tolerance)
-        if self._state_topic is not None:
+        self._recorded: RecordedSteps | None = None
+        if self.exact:
             self._recorded = RecordedSteps(plan, tolerance)
-        else:
-            self._stream = SignalStream(bag, plan.mapping, plan.vehicle.params)
-            check_signals(bag, plan.mapping, self._stream, wheels=True)
-            self._notes += [*self._stream.problems, *filter(None, [self._stream.use_log_times()])]
-            self._reconstructed = ReconstructedSteps(plan, itertools.islice(self._stream, _PROBE_READINGS))
-            self._stream.taken.clear()
-            self._stream.bad.clear()
-            self._stream.without.clear()
+            return
+        self._stream = SignalStream(bag, plan.mapping, plan.vehicle.params)
+        check_signals(bag, plan.mapping, self._stream, wheels=True)
+        self._report.notes += [*self._stream.problems, *filter(None, [self._stream.use_log_times()])]
+        self._reconstructed = ReconstructedSteps(plan, itertools.islice(self._stream, _PROBE_READINGS))
+        self._stream.forget()
 
     @property
     def exact(self) -> bool:
         """Steps are repeated from the recorded state."""
-        return self._recorded is not None
+        return self._report.exact
 
     def steps(self, progress: Callable[[int, int], None] | None = None) -> Iterator[tuple[Message, list[ReplayedStep]]]:
         """Every message of the bag, with the steps it caused.
 
         `progress(messages, log_time_ns)` is called now and then.
         """
+        report = self._report
         for batch in _batches(self._bag.messages()):
-            repeated = self._repeated(batch)
-            for message in batch:
-                self._messages += 1
-                if progress is not None and self._messages % PROGRESS_EVERY == 0:
-                    progress(self._messages, message.log_time_ns)
-                steps = self._take(message) if message.topic != self._state_topic else next(repeated)
+            made = self._made(batch) if self._recorded is None else self._repeated(batch, self._recorded)
+            for message, steps in zip(batch, made, strict=True):
+                report.messages += 1
+                if progress is not None and report.messages % PROGRESS_EVERY == 0:
+                    progress(report.messages, message.log_time_ns)
+                if (command := self._commands.get(message.topic)) is not None:
+                    try:
+                        command.recorded(message)
+                    except UnreadableError:
+                        report.bad_messages += 1
                 for step in steps:
-                    first_ns, last_ns = self._stamps if self._steps else (step.stamp_ns, step.stamp_ns)
-                    self._span_ns += max(step.stamp_ns - last_ns, 0)
-                    self._stamps = (first_ns, step.stamp_ns)
-                    self._steps += 1
+                    if not report.steps:
+                        report.first_stamp_ns = report.last_stamp_ns = step.stamp_ns
+                    report.span_ns += max(step.stamp_ns - report.last_stamp_ns, 0)
+                    report.last_stamp_ns = step.stamp_ns
+                    report.steps += 1
                     self._compare(step)
                 yield message, steps
 
     def report(self) -> ReplayReport:
         """What has been done so far."""
-        source = self._recorded or self._reconstructed
-        commands = [command.result() for command in self._commands.values()]
-        return ReplayReport(
-            [*self._notes, *self._lost_wheels(), *self._too_few_steps()],
-            self.exact,
-            self._messages,
-            self._steps,
-            *self._stamps,
-            self._span_ns,
-            self._recorded.gaps if self._recorded else 0,
-            self._recorded.changed if self._recorded else 0,
-            self._reconstructed.restarts if self._reconstructed else 0,
-            self._bad_messages + (self._stream.bad_messages if self._stream else 0),
-            self._reconstructed.dropped if self._reconstructed else {},
-            dict(source.faults) if source else {},
-            self._bag.damage,
-            [found for found in (*commands, self._state_comparer.result()) if found.has_record],
-            self._not_compared,
+        compared = [*(command.result() for command in self._commands.values()), self._state_comparer.result()]
+        report = replace(
+            self._report, damage=self._bag.damage, comparison=[found for found in compared if found.has_record]
         )
+        if self._recorded is not None:
+            report.gaps, report.changed = self._recorded.gaps, self._recorded.changed
+            report.faults = dict(self._recorded.faults)
+            return report
+        report.notes = [*report.notes, *self._lost_wheels(), *self._too_few_steps()]
+        report.bad_messages += self._stream.bad_messages
+        report.restarts, report.dropped = self._reconstructed.restarts, self._reconstructed.dropped
+        report.faults = dict(self._reconstructed.faults)
+        return report
 
     def why_no_step(self) -> str:
         """Why the bag gave no control step, topic by topic."""
-        if self._stream is None or self._reconstructed is None:
-            return f"{self._state_topic}: {self._bad_messages} messages that cannot be read"
+        if self.exact:
+            return f"{self._state_topic}: {self._report.bad_messages} messages that cannot be read"
         parts = []
         for topic in sorted(self._stream.topics):
             part = f"{topic}: {self._stream.taken[topic]} messages"
@@ -192,46 +181,32 @@ class Replay:
             parts.append(f"{name} not believed: " + ", ".join(f"{count} {reason}" for reason, count in reasons.items()))
         for reason, count in self._reconstructed.faults.items():
             parts.append(f"{count} without a command: {reason}")
-        return "; ".join([*parts, *self._notes]) or "no message"
+        return "; ".join([*parts, *self._report.notes]) or "no message"
 
     def _lost_wheels(self) -> list[str]:
         """A line for each set of wheels that messages had no number for."""
-        without = self._stream.without if self._stream is not None else {}
-        return [f"{which} has no number in {count} messages: lost, as in the node" for which, count in without.items()]
+        without = self._stream.without.items()
+        return [f"{which} has no number in {count} messages: lost, as in the node" for which, count in without]
 
     def _too_few_steps(self) -> list[str]:
         """A line, if the bag gave far fewer steps than it holds wheel speeds."""
-        if self._stream is None or not self._steps:
-            return []
+        steps = self._report.steps
         wheels = max(self._stream.taken[topic] for topic in self._stream.topics)
-        if self._steps > _FEW_STEPS * wheels:
+        if not steps or steps > _FEW_STEPS * wheels:
             return []
-        return [f"only {self._steps} steps of {wheels} messages: {self.why_no_step()}"]
-
-    def _take(self, message: Message) -> list[ReplayedStep]:
-        command = self._commands.get(message.topic)
-        if command is not None:
-            try:
-                command.recorded(message)
-            except UnreadableError:
-                self._bad_messages += 1
-            return []
-        if self._stream is None or self._reconstructed is None:
-            return []
-        values = self._stream.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns)
-        return self._reconstructed.take(values) if values else []
+        return [f"only {steps} steps of {wheels} messages: {self.why_no_step()}"]
 
     def _find_commands(self, mapping: SignalMapping, tolerance: float) -> None:
         for name, (kind, sink) in command_topics(self._bag, mapping).items():
             try:
                 command = RecordedCommand(self._bag, mapping, kind, sink, name, tolerance)
             except (BagError, ConfigError) as error:
-                self._not_compared.append(f"{name}: {error}")
+                self._report.not_compared.append(f"{name}: {error}")
                 continue
-            if command.stamped or self._state_topic is not None:
+            if command.stamped or self.exact:
                 self._commands[name] = command
             else:
-                self._not_compared.append(f"{name}: carries no stamp, and the bag no state to tell its step")
+                self._report.not_compared.append(f"{name}: carries no stamp, and the bag no state to tell its step")
         held = {sink.topic for _, sink in command_topics(self._bag, mapping).values()}
         elsewhere = commands_elsewhere(self._bag, mapping, report_topics(self._bag))
         for kind, sinks in mapping.commands.items():
@@ -239,51 +214,42 @@ class Replay:
             if absent:
                 likely = ", ".join(elsewhere[kind][:_CANDIDATES])
                 hint = f"; of its type: {likely}; {_RENAME}" if likely else ""
-                self._not_compared.append(f"{kind} on {absent} ({mapping.path}): not in the bag{hint}")
+                self._report.not_compared.append(f"{kind} on {absent} ({mapping.path}): not in the bag{hint}")
             elif not sinks:
-                self._not_compared.append(f"{kind}: goes nowhere ({mapping.path})")
+                self._report.not_compared.append(f"{kind}: goes nowhere ({mapping.path})")
 
-    def _repeated(self, batch: Sequence[Message]) -> Iterator[list[ReplayedStep]]:
-        """The step of each recorded state of a batch, as the state's turn comes; none for one that cannot be read."""
-        if self._recorded is None:
-            return iter(())
-        states = [
-            (message.log_time_ns, self._taken(message)) for message in batch if message.topic == self._state_topic
-        ]
-        steps = iter(self._recorded.repeated())
-        return (self._held_against(*state, steps) for state in states)
+    def _made(self, batch: Sequence[Message]) -> Iterator[list[ReplayedStep]]:
+        """The steps that each message of a batch causes as an input."""
+        for message in batch:
+            values = self._stream.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns)
+            yield self._reconstructed.take(values) if values else []
 
-    def _taken(self, message: Message) -> NamedValues | None:
-        """Take a recorded state; None, and it counts as bad, if it is none."""
-        assert self._recorded is not None
+    def _repeated(self, batch: Sequence[Message], recorded: RecordedSteps) -> Iterator[list[ReplayedStep]]:
+        """The step of each message of a batch that is a recorded state."""
+        taken = [message.topic == self._state_topic and self._take_state(message, recorded) for message in batch]
+        steps = iter(recorded.repeated())
+        return ([step] if one and (step := next(steps)) is not None else [] for one in taken)
+
+    def _take_state(self, message: Message, steps: RecordedSteps) -> bool:
+        """Take a recorded state; False, and it counts as bad, if it is none."""
         try:
-            recorded = _STATE_READER(message.data)
-            self._recorded.take(recorded, message.log_time_ns, message.publish_time_ns)
+            stamp_ns, names, values = _STATE_READER(message.data)
+            steps.take(names, values, stamp_ns, message)
         except KeyError as error:
             raise BagError(
                 f"{self._bag.path}: {message.topic} lacks the signal {error}: recorded by another version"
             ) from None
         except (UnreadableError, ValueError):
-            self._bad_messages += 1
-            return None
-        return recorded
-
-    def _held_against(
-        self, log_time_ns: int, recorded: NamedValues | None, steps: Iterator[ReplayedStep | None]
-    ) -> list[ReplayedStep]:
-        """What a recorded state says, for the comparison, and its step."""
-        if recorded is None:
-            return []
-        names, values = recorded.names, recorded.values
+            self._report.bad_messages += 1
+            return False
         if list(names) == SIGNAL_NAMES:
             names, values = DECIDED_NAMES, values[DECIDED]
         else:
             found = dict(zip(names, values, strict=True))
             names = tuple(name for name in DECIDED_NAMES if name in found)
             values = tuple(found[name] for name in names)
-        self._state_comparer.recorded(recorded.stamp_ns, log_time_ns, names, values)
-        step = next(steps)
-        return [step] if step is not None else []
+        self._state_comparer.recorded(stamp_ns, message.log_time_ns, names, values)
+        return True
 
     def _compare(self, step: ReplayedStep) -> None:
         for command in self._commands.values():
@@ -394,17 +360,8 @@ def report_topics(bag: BagReader) -> list[str]:
 
 def _carries_steps(bag: BagReader, topic: str) -> bool:
     """Whether the first message of a topic names the signals of a control step."""
-    first = next((message for message in bag.messages() if message.topic == topic), None)
+    first = first_message(bag, topic)
     try:
         return first is not None and set(DECIDED_NAMES) - set(YOUNGER_SIGNALS) <= set(_STATE_READER(first.data).names)
     except UnreadableError:
         return False
-
-
-def _with_messages(bag: BagReader, topic: str | None) -> str | None:
-    """The topic, if at least one message of it was recorded."""
-    if topic is None:
-        return None
-    if bag.counts:
-        return topic if bag.counts.get(topic) else None
-    return topic if any(message.topic == topic for message in bag.messages()) else None

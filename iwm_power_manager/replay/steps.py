@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iwm_power_manager.bags.reader import Message
 from iwm_power_manager.control import lockstep
 from iwm_power_manager.control.budget import BUCKET_MIN
 from iwm_power_manager.control.controller import Controller, ControllerLimits
@@ -46,7 +47,7 @@ from iwm_power_manager.control.types import Command, ControllerState, SideGrip, 
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import Recorded
 from iwm_power_manager.signals.contract import WHEEL_NAMES
-from iwm_power_manager.signals.readings import DemandReading, FrictionReading, NamedValues
+from iwm_power_manager.signals.readings import DemandReading, FrictionReading
 
 #: What each kind of reading is to the controller.
 _TOPICS = {
@@ -87,6 +88,7 @@ class ReplayedStep(NamedTuple):
     log_time_ns, publish_time_ns : of the message that caused the step
     command : what it decided
     values : numbers of `control.record.SIGNALS`
+    recorded : the same as recorded; () of a step made from inputs
     """
 
     stamp_ns: int
@@ -94,6 +96,7 @@ class ReplayedStep(NamedTuple):
     publish_time_ns: int
     command: Command
     values: Sequence[float]
+    recorded: Sequence[float] = ()
 
 
 class _Due(NamedTuple):
@@ -146,13 +149,14 @@ class RecordedSteps:
         self._made: ReplayedStep | None = None
         self._alike_s = 0.0  # for how long all memories have given the same
 
-    def take(self, recorded: NamedValues, log_time_ns: int, publish_time_ns: int) -> None:
-        """Take one step; `KeyError` or `ValueError` if the message is of another kind or version."""
+    def take(self, names: Sequence[str], values: Sequence[float], stamp_ns: int, message: Message) -> None:
+        """Take one step's numbers; `KeyError` or `ValueError` if the message is of another kind or version."""
         plan = self._plan
-        numbers = completed(recorded.names, recorded.values)
+        numbers = completed(names, values)
         number = step_of(numbers)
-        if number + 1 == self._next and recorded.stamp_ns == self._stamp_ns:
-            self._blocks[-1].due.append(_Due(recorded.stamp_ns, log_time_ns, publish_time_ns, ()))
+        times = stamp_ns, message.log_time_ns, message.publish_time_ns
+        if number + 1 == self._next and stamp_ns == self._stamp_ns:
+            self._blocks[-1].due.append(_Due(*times, ()))
             return
         if numbers[SETTINGS] != self._recorded:  # they rarely change
             self._settings = from_numbers(numbers).settings._replace(**plan.changes)
@@ -163,9 +167,9 @@ class RecordedSteps:
         last = self._blocks[-1] if self._blocks else None
         if begins is not None or last is None or last.settings is not self._settings or last.table is not table:
             self._blocks.append(_Block(self._settings, table, begins, []))
-        self._blocks[-1].due.append(_Due(recorded.stamp_ns, log_time_ns, publish_time_ns, numbers))
+        self._blocks[-1].due.append(_Due(*times, numbers))
         self.gaps += bool(begins)
-        self._next, self._stamp_ns = number + 1, recorded.stamp_ns
+        self._next, self._stamp_ns = number + 1, stamp_ns
 
     def repeated(self) -> list[ReplayedStep | None]:
         """One step for each that was taken since the last call; None for one without a command."""
@@ -181,7 +185,7 @@ class RecordedSteps:
                 command = command_of(row[DECIDED])
                 problem = violated_bound(command, self._plan.vehicle.params)
                 self.faults.update([problem] if problem else [])
-                self._made = None if problem else ReplayedStep(*due[:3], command, row)
+                self._made = None if problem else ReplayedStep(*due[:3], command, row, due.numbers)
             yield self._made and self._made._replace(log_time_ns=due.log_time_ns, publish_time_ns=due.publish_time_ns)
 
     def _computed(self, block: _Block, recorded: list[Sequence[float]]) -> list[list[float]]:

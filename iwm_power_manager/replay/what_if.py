@@ -11,30 +11,29 @@ driver's reaction to power that was not delivered, another mass.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 
 from iwm_power_manager.bags.reader import BagReader
-from iwm_power_manager.control.record import DECIDED, command_of, completed, measurement_of
+from iwm_power_manager.control.record import DECIDED, command_of, measurement_of
 from iwm_power_manager.control.types import Measurement, Wheels
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.replay.plan import Plan
-from iwm_power_manager.replay.run import Replay, state_topic
-from iwm_power_manager.signals.cdr import UnreadableError
-from iwm_power_manager.signals.contract import WHEEL_NAMES
-from iwm_power_manager.signals.readings import joint_state_reader
+from iwm_power_manager.replay.run import Replay
 
-_J_PER_WH = 3600.0
+_S_PER_H = 3600.0
 #: Difference of the work at the wheels, by the energy taken, below which two drives are the same.
 _SAME_WORK = 0.001
 _LEAST_DISTANCE_M = 1.0
 
 
-class Consumption(NamedTuple):
-    """What one strategy would have consumed.
+@dataclass
+class Consumption:
+    """What one strategy would have consumed, added up step by step.
 
     Attributes
     ----------
@@ -45,19 +44,43 @@ class Consumption(NamedTuple):
     wheel_work_wh : work of motors, brakes and idle drag at the wheels
     friction_wh : of that, turned into heat by the friction brakes
     idle_drag_wh : of that, dragged by idle motors
-    step_s : mean length of a control step
+    steps, step_s : control steps, and their mean length
     friction : least and greatest that the law assumed
     """
 
     label: str
-    distance_m: float
-    chemical_wh: float
-    electrical_wh: float
-    wheel_work_wh: float
-    friction_wh: float
-    idle_drag_wh: float
-    step_s: float
-    friction: tuple[float, float]
+    distance_m: float = 0.0
+    chemical_wh: float = 0.0
+    electrical_wh: float = 0.0
+    wheel_work_wh: float = 0.0
+    friction_wh: float = 0.0
+    idle_drag_wh: float = 0.0
+    steps: int = 0
+    step_s: float = 0.0
+    friction: tuple[float, float] = (math.inf, -math.inf)
+
+    def add(self, vehicle: VehicleParams, measurement: Measurement, motor_nm: Wheels, brake_nm: Wheels) -> None:
+        """One step with these torques."""
+        hours = measurement.dt_s / _S_PER_H
+        electrical = work = friction = drag = 0.0
+        for wheel, (speed, torque, brake) in enumerate(
+            zip(measurement.wheel_speed_radps, motor_nm, brake_nm, strict=True)
+        ):
+            motor = _axle(vehicle, wheel).motor
+            electrical += electrical_power_w(torque, speed, motor)
+            dragging = idle_drag_nm(torque, speed, motor) * speed
+            drag += dragging
+            friction += brake * speed
+            work += (torque + brake) * speed - dragging
+        self.distance_m += measurement.speed_mps * measurement.dt_s
+        self.chemical_wh += chemical_power_w(electrical, vehicle.battery) * hours
+        self.electrical_wh += electrical * hours
+        self.wheel_work_wh += work * hours
+        self.friction_wh += friction * hours
+        self.idle_drag_wh += drag * hours
+        self.steps += 1
+        self.step_s += (measurement.dt_s - self.step_s) / self.steps
+        self.friction = min(self.friction[0], measurement.friction), max(self.friction[1], measurement.friction)
 
     @property
     def wh_per_km(self) -> float:
@@ -69,48 +92,6 @@ class Consumption(NamedTuple):
         if abs(self.wheel_work_wh - reference.wheel_work_wh) > _SAME_WORK * abs(reference.chemical_wh):
             return None
         return 100.0 * (1.0 - self.chemical_wh / reference.chemical_wh)
-
-
-class EnergyMeter:
-    """Adds up what motors and battery of a car do, step by step."""
-
-    def __init__(self, label: str, vehicle: VehicleParams) -> None:
-        self._label = label
-        self._vehicle = vehicle
-        self._distance_m = self._time_s = 0.0
-        self._steps = 0
-        self._friction = (math.inf, -math.inf)
-        self._joules = [0.0] * 5
-
-    def add(self, measurement: Measurement, motor_torque_nm: Wheels, friction_torque_nm: Wheels) -> None:
-        """One step with these torques."""
-        dt_s = measurement.dt_s
-        electrical = work = friction = drag = 0.0
-        for wheel in range(len(WHEEL_NAMES)):
-            speed, torque, brake = (
-                measurement.wheel_speed_radps[wheel],
-                motor_torque_nm[wheel],
-                friction_torque_nm[wheel],
-            )
-            motor = _axle(self._vehicle, wheel).motor
-            electrical += electrical_power_w(torque, speed, motor)
-            dragging = idle_drag_nm(torque, speed, motor) * speed
-            drag += dragging
-            friction += brake * speed
-            work += (torque + brake) * speed - dragging
-        chemical = chemical_power_w(electrical, self._vehicle.battery)
-        self._distance_m += measurement.speed_mps * dt_s
-        self._time_s += dt_s
-        self._steps += 1
-        self._friction = min(self._friction[0], measurement.friction), max(self._friction[1], measurement.friction)
-        for i, power in enumerate((chemical, electrical, work, friction, drag)):
-            self._joules[i] += power * dt_s
-
-    def result(self) -> Consumption:
-        """The sums so far."""
-        step_s = self._time_s / max(self._steps, 1)
-        wh = [joules / _J_PER_WH for joules in self._joules]
-        return Consumption._make((self._label, self._distance_m, *wh, step_s, self._friction))
 
 
 def what_if(
@@ -131,49 +112,29 @@ def what_if(
     """
     vehicle = plans[0][1].vehicle.params
     forces_n: dict[int, float] = {}
-    results = []
-    state = state_topic(bag)
-    if state is not None and Replay(bag, plans[0][1]).exact:
-        meter = EnergyMeter("recorded", vehicle)
-        for stamp_ns, step in _recorded_steps(bag, state):
-            forces_n[stamp_ns] = force_n(vehicle, *step)
-            meter.add(*step)
-        results.append(meter.result())
+    rows: list[Consumption] = []
     for label, plan in plans:
-        meter = EnergyMeter(label, vehicle)
         replay = Replay(bag, plan)
-        first = not results
+        recorded = Consumption("recorded") if replay.exact and not rows else None
+        row = Consumption(label)
         for _, steps in replay.steps(progress):
-            for done in steps:
-                measurement = measurement_of(done.values)
-                torques, brakes = done.command.motor_torque_nm, done.command.friction_torque_nm
-                if first:
-                    forces_n[done.stamp_ns] = force_n(vehicle, measurement, torques, brakes)
-                elif (wanted_n := forces_n.get(done.stamp_ns)) is not None:
-                    torques = at_force(vehicle, measurement, torques, brakes, wanted_n)
-                meter.add(measurement, torques, brakes)
+            for step in steps:
+                measurement = measurement_of(step.values)
+                if recorded is not None:
+                    with suppress(ValueError, OverflowError):  # numbers that are no command: the comparison shows them
+                        was = command_of(step.recorded[DECIDED])
+                        torques = measurement, was.motor_torque_nm, was.friction_torque_nm
+                        forces_n[step.stamp_ns] = force_n(vehicle, *torques)
+                        recorded.add(vehicle, *torques)
+                motor_nm, brake_nm = step.command.motor_torque_nm, step.command.friction_torque_nm
+                wanted_n = forces_n.setdefault(step.stamp_ns, force_n(vehicle, measurement, motor_nm, brake_nm))
+                row.add(vehicle, measurement, at_force(vehicle, measurement, motor_nm, brake_nm, wanted_n), brake_nm)
         if not replay.report().steps:
             raise BagError(f"{bag.path}: gave no control step: {replay.why_no_step()}")
-        results.append(meter.result())
-    if results[0].distance_m < _LEAST_DISTANCE_M or results[0].chemical_wh == 0.0:
-        raise BagError(
-            f"{bag.path}: the car does not move ({results[0].distance_m:.2f} m): there is nothing to compare"
-        )
-    return results
-
-
-def _recorded_steps(bag: BagReader, state: str) -> Iterator[tuple[int, tuple[Measurement, Wheels, Wheels]]]:
-    """What the law took in each recorded step, and what it commanded."""
-    decode = joint_state_reader("position")
-    for message in bag.messages():
-        if message.topic == state:
-            try:
-                recorded = decode(message.data)
-                values = completed(recorded.names, recorded.values)
-                command = command_of(values[DECIDED])
-            except (UnreadableError, KeyError, ValueError, OverflowError):
-                continue  # the replay counts it
-            yield recorded.stamp_ns, (measurement_of(values), command.motor_torque_nm, command.friction_torque_nm)
+        rows += [row] if recorded is None else [recorded, row]
+    if rows[0].distance_m < _LEAST_DISTANCE_M or rows[0].chemical_wh == 0.0:
+        raise BagError(f"{bag.path}: the car does not move ({rows[0].distance_m:.2f} m): there is nothing to compare")
+    return rows
 
 
 def force_n(vehicle: VehicleParams, measurement: Measurement, motor_nm: Wheels, brake_nm: Wheels) -> float:

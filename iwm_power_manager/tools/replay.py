@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -200,7 +201,7 @@ def _what_if(bag: BagReader, options: argparse.Namespace) -> int:
     if None in savings:
         lines.append("  no saving where the motors could not give that force: the work at the wheels is another")
     lines += [f"  damaged: {line}" for line in bag.damage]
-    found = [{**row._asdict(), "saving_percent": saving} for row, saving in zip(rows, savings, strict=True)]
+    found = [{**asdict(row), "saving_percent": saving} for row, saving in zip(rows, savings, strict=True)]
     _show(lines, {"bag": str(bag.path), "rows": found, "damage": bag.damage}, options)
     return DONE
 
@@ -281,10 +282,7 @@ def _result(bag: BagReader, plan: Plan, report: ReplayReport) -> dict[str, Any]:
         "vehicle_hash": plan.vehicle.hash,
         "policies": plan.policies.checksums,
         "other_policy": _is_other_policy(bag, plan),
-        **report._asdict(),
-        "comparison": [
-            {**topic._asdict(), "first": topic.first._asdict() if topic.first else None} for topic in report.comparison
-        ],
+        **asdict(report),
     }
 
 

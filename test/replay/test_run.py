@@ -528,14 +528,13 @@ def test_what_if_says_what_it_was_made_with(drive: Path, capsys: pytest.CaptureF
 def test_energy_of_a_constant_step_is_power_times_time(drive: Path) -> None:
     from iwm_power_manager.control.types import Measurement
     from iwm_power_manager.model.motor import electrical_power_w
-    from iwm_power_manager.replay.what_if import EnergyMeter
+    from iwm_power_manager.replay.what_if import Consumption
 
     car = ScriptedDrive("equal").vehicle.params
-    meter = EnergyMeter("x", car)
+    found = Consumption("x")
     measurement = Measurement(10.0, (30.0,) * 4, 0.0, 0.5, 0.9, 1e5, 1e5, 0.7)
     for _ in range(8):
-        meter.add(measurement, (20.0,) * 4, (0.0, 0.0, -1.0, -1.0))
-    found = meter.result()
+        found.add(car, measurement, (20.0,) * 4, (0.0, 0.0, -1.0, -1.0))
     assert found.distance_m == pytest.approx(40.0)
     assert found.electrical_wh == pytest.approx(4 * electrical_power_w(20.0, 30.0, car.front.motor) * 4.0 / 3600.0)
     assert found.chemical_wh > found.electrical_wh
@@ -654,7 +653,7 @@ def test_a_comparison_tells_largest_rms_first_and_what_has_no_counterpart() -> N
     assert found.rms == pytest.approx(np.sqrt((0.25**2 + 9.0) / 6.0))
     assert (found.only_recorded, found.only_recomputed) == (1, 1)
     assert found.first is not None
-    assert found.first._asdict() == {
+    assert dataclasses.asdict(found.first) == {
         "message": 1, "stamp_ns": 2, "log_time_ns": 102, "name": "a", "recorded": 1.0, "recomputed": 4.0,
     }  # fmt: skip
     comparer.recorded(6, 106, ("a",), (0.0,))
