@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
@@ -18,7 +19,8 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from rosbags.rosbag2.metadata import dump_qos_v9
 from rosbags.rosbag2.metadata import parse_qos as rosbags_qos
 
-from iwm_power_manager.bags.limits import MAX_METADATA_BYTES, MAX_QOS_BYTES
+from iwm_power_manager.bags.limits import MAX_METADATA_BYTES, MAX_QOS_BYTES, regular_file
+from iwm_power_manager.errors import BagError
 
 METADATA_FILE = "metadata.yaml"
 METADATA_VERSION = 9
@@ -143,30 +145,48 @@ def information_of(text: str) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def problem_with(information: Mapping[str, Any]) -> str:
-    """The key of a `metadata.yaml` that is missing or holds something of the wrong kind; "" for none."""
-    entries = information.get("topics_with_message_count")
+def read_metadata(folder: Path) -> tuple[dict[str, Any], str]:
+    """What the `metadata.yaml` of a folder says ({} for nothing), and a line of what is wrong with it ("" for nothing).
+
+    Whatever is wrong, the data files can be read without it.
+    """
+    path = folder / METADATA_FILE
+    if not os.path.lexists(path):
+        return {}, f"{folder}: has no metadata.yaml: the recorder did not finish"
     try:
-        wanted: list[tuple[str, object, type]] = [
-            ("version", information.get("version"), int),
-            ("storage_identifier", information.get("storage_identifier"), str),
-            ("relative_file_paths", information.get("relative_file_paths"), list),
-            ("message_count", information.get("message_count"), int),
-            ("duration", information.get("duration", {}).get("nanoseconds"), int),
-            ("starting_time", information.get("starting_time", {}).get("nanoseconds_since_epoch"), int),
-            ("custom_data", information.get("custom_data") or {}, Mapping),
-            ("topics_with_message_count", entries, list),
-        ]
-        wanted += [("relative_file_paths", name, str) for name in information.get("relative_file_paths") or ()]
-        for entry in entries or ():
-            wanted.append(("a topic's message_count", entry["message_count"], int))
-            wanted += [(f"a topic's {key}", entry["topic_metadata"][key], str) for key in _TOPIC_KEYS]
-    except (AttributeError, TypeError, KeyError) as error:
-        return f"an entry ({error})" if isinstance(error, KeyError) else "an entry"
-    return next((key for key, content, kind in wanted if not isinstance(content, kind)), "")
+        if regular_file(path, folder) <= MAX_METADATA_BYTES:
+            found = information_of(path.read_text(encoding="utf-8-sig"))
+            key = _wrong_key(found, _KINDS, "")
+            return found, f"{path}: {key} is missing or of the wrong kind; the data files are read" if key else ""
+    except (BagError, OSError, UnicodeDecodeError):
+        pass
+    return {}, f"{path}: cannot be read; the data files are"
 
 
-_TOPIC_KEYS = ("name", "type", "serialization_format")
+#: What has to stand in a `metadata.yaml`, and of which kind.
+_KINDS = {
+    "version": int,
+    "storage_identifier": str,
+    "relative_file_paths": [str],
+    "message_count": int,
+    "duration": {"nanoseconds": int},
+    "starting_time": {"nanoseconds_since_epoch": int},
+    "custom_data": dict | None,
+    "topics_with_message_count": [
+        {"message_count": int, "topic_metadata": {"name": str, "type": str, "serialization_format": str}}
+    ],
+}
+
+
+def _wrong_key(content: object, kind: Any, key: str) -> str:
+    """The first key that is missing or holds something of another kind; "" for none."""
+    if isinstance(kind, dict):
+        inner = [(content.get(name), of, name) for name, of in kind.items()] if isinstance(content, dict) else None
+    elif isinstance(kind, list):
+        inner = [(item, kind[0], key) for item in content] if isinstance(content, list) else None
+    else:
+        inner = [] if isinstance(content, kind) else None
+    return key if inner is None else next(filter(None, (_wrong_key(*one) for one in inner)), "")
 
 
 def text_values(content: object) -> dict[str, str]:

@@ -11,16 +11,16 @@ import heapq
 import os
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
-from iwm_power_manager.bags.limits import MAX_METADATA_BYTES, ZSTD_MAGIC, decompress, decompress_file, regular_file
+from iwm_power_manager.bags.limits import ZSTD_MAGIC, decompress, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_records import MAGIC
 from iwm_power_manager.bags.mcap_source import McapSource
-from iwm_power_manager.bags.metadata import METADATA_FILE, Topic, information_of, problem_with, text_values
+from iwm_power_manager.bags.metadata import Topic, read_metadata, text_values
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.share import did_you_mean
@@ -80,7 +80,8 @@ class BagReader:
         self.sources: list[Source] = []
         self._opened: list[Path] = []
         try:
-            self.information = self._information()
+            self.information, problem = read_metadata(self.path) if os.path.isdir(self.path) else ({}, "")
+            self._damage += [problem] if problem else []
             self._open_all()
         except BaseException:
             self.close()
@@ -154,25 +155,6 @@ class BagReader:
                 source.note(f"{topic.name} has more than one definition; it is read by the first")
         self.custom_data = source.custom_data() | self.custom_data
 
-    def _information(self) -> dict[str, Any]:
-        path = self.path / METADATA_FILE
-        if not os.path.isdir(self.path):
-            return {}
-        if not os.path.lexists(path):
-            self._damage.append(f"{self.path}: has no metadata.yaml: the recorder did not finish")
-            return {}
-        try:
-            if regular_file(path, self.path) <= MAX_METADATA_BYTES:
-                found = information_of(path.read_text(encoding="utf-8-sig"))
-                problem = problem_with(found)
-                if problem:
-                    self._damage.append(f"{path}: {problem} is missing or of the wrong kind; the data files are read")
-                return found
-        except (BagError, OSError, UnicodeDecodeError):
-            pass
-        self._damage.append(f"{path}: cannot be read; the data files are")
-        return {}
-
     def _open_all(self) -> None:
         problems = []
         for name in self._file_names():
@@ -190,13 +172,20 @@ class BagReader:
     def _file_names(self) -> list[Path]:
         if not os.path.isdir(self.path):
             return [self.path]
-        # Older versions put the folder's name in front; what leads elsewhere is looked for here, and is not.
-        content = self.information.get("relative_file_paths")
-        listed = [self.path / PurePosixPath(str(name)).name for name in (content if isinstance(content, list) else [])]
-        names = list(dict.fromkeys(name for name in listed if name != self.path))
+        names = [self.path / name for name in listed_files(self.information)]
         present = [name for name in names if os.path.exists(name)]
         self._damage += [f"{name}: is missing" for name in names if name not in present]
         return present or data_files(self.path)
+
+
+def listed_files(information: Mapping[str, Any]) -> dict[str, None]:
+    """Names of the data files that a `metadata.yaml` lists, in its order.
+
+    Older versions put the folder's name in front; what leads elsewhere is looked for in the folder, and is not there.
+    """
+    listed = information.get("relative_file_paths")
+    names = (PurePosixPath(str(name)).name for name in (listed if isinstance(listed, list) else []))
+    return dict.fromkeys(filter(None, names))
 
 
 def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside: bool = False) -> tuple[Path, str]:

@@ -15,7 +15,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -36,13 +36,13 @@ from iwm_power_manager.bags.mcap_records import (
     walk,
 )
 from iwm_power_manager.bags.mcap_source import McapSource
-from iwm_power_manager.bags.metadata import FileSpan, Topic, text_values
+from iwm_power_manager.bags.metadata import FileSpan, Topic, read_metadata, text_values
 from iwm_power_manager.bags.reader import (
     COMPRESSED_SUFFIX,
     SUFFIXES,
-    BagReader,
     Source,
     data_files,
+    listed_files,
     open_source,
     opened_file,
 )
@@ -141,7 +141,8 @@ def recover(path: Path | str) -> Recovery:
     with ExitStack() as stack:
         files: list[_File] = []
         left_out: list[FileRecovery] = []
-        for name in _names(path):
+        names = _names(path)
+        for name in names:
             try:
                 regular_file(name, folder)
                 files.append(_File(name, stack))
@@ -149,16 +150,17 @@ def recover(path: Path | str) -> Recovery:
                 left_out.append(FileRecovery(name.name, False, 0, str(error)))
         if not files:
             raise BagError(f"{left_out[0].damage}; nothing to recover")
-        recorded = _recorded(path) if folder and not left_out else None
+        information, problem = read_metadata(path) if folder else ({}, "none")
+        fits = not (problem or left_out) and listed_files(information).keys() == {name.name for name in names}
         sqlite = all(file.is_sqlite and not file.problem for file in files)
         for file in files:
-            if file.problem or (file.is_sqlite and not sqlite) or (file.is_compressed and recorded is None):
+            if file.problem or (file.is_sqlite and not sqlite) or (file.is_compressed and not fits):
                 file.rebuild()
         for file in files:
             file.put_in_place()
-        stale = folder is not None and (recorded is None or any(file.report.rebuilt for file in files))
+        stale = folder is not None and not (fits and not any(file.report.rebuilt for file in files))
         if stale:
-            _write_metadata(path, files, "sqlite3" if sqlite else "mcap")
+            _write_metadata(path, files, "sqlite3" if sqlite else "mcap", information)
         spans = [file.seen.span for file in files if file.seen.count]
         return Recovery(
             path,
@@ -188,16 +190,6 @@ def _names(path: Path) -> list[Path]:
 def _target(path: Path) -> Path:
     """Where the recovered file goes."""
     return path.with_name(path.name.removesuffix(COMPRESSED_SUFFIX)).with_suffix(".mcap")
-
-
-def _recorded(folder: Path) -> dict[str, object] | None:
-    """What a bag's metadata says; None if it is missing, makes no sense, or speaks of other files than there are."""
-    try:
-        with BagReader(folder) as bag:
-            listed = {str(name).rpartition("/")[2] for name in bag.information.get("relative_file_paths") or []}
-            return bag.information if not bag.damage and listed == {name.name for name in _names(folder)} else None
-    except BagError:
-        return None
 
 
 class _Seen:
@@ -388,14 +380,8 @@ def _missing(files: Iterable[_File]) -> dict[str, int]:
     return dict(+found)
 
 
-def _write_metadata(folder: Path, files: list[_File], storage: str) -> None:
+def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Mapping[str, object]) -> None:
     """`metadata.yaml` of the whole bag, with what the old one or the files know of it."""
-    recorded: dict[str, object] = {}
-    try:
-        with BagReader(folder) as bag:
-            recorded = bag.information
-    except BagError:
-        pass  # what it says may still be read from the files
     topics: dict[str, Topic] = {}
     counts: Counter[str] = Counter()
     custom_data: dict[str, str] = {}
