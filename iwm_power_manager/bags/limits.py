@@ -86,36 +86,22 @@ def decompress(compression: str, data: bytes, size: int | None = None) -> bytes:
 
 
 def _decompressed(compression: str, data: bytes, most: int) -> bytes:
-    if compression == "":
-        return data[:most]
-    if compression == "zstd":
-        return _unzstd(data, most)
-    if compression == "lz4":
-        import lz4.frame
-
-        try:
-            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most))
-        except (RuntimeError, EOFError, MemoryError):
-            raise BagError("cannot be decompressed") from None
-    raise BagError(f"is compressed with {compression!r}; known: zstd, lz4")
-
-
-def _unzstd(data: bytes, most: int) -> bytes:
+    import lz4.frame
     import zstandard
 
-    context = _zstd()
     try:
-        if 0 <= zstandard.frame_content_size(data) < most:
-            return bytes(context.decompress(data))  # allocates what the frame says, which is allowed
-        with context.stream_reader(io.BytesIO(data), read_across_frames=True) as reader:
-            pieces: list[bytes] = []
-            left = most
-            while left > 0 and (piece := reader.read(min(left, 1 << 20))):
-                pieces.append(piece)
-                left -= len(piece)
-            return b"".join(pieces)
-    except (zstandard.ZstdError, MemoryError):
+        if compression == "":
+            return data[:most]
+        if compression == "lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most))
+        if compression == "zstd" and 0 <= zstandard.frame_content_size(data) < most:
+            return bytes(_zstd().decompress(data))  # allocates what the frame says, which is allowed
+        if compression == "zstd":
+            with _zstd().stream_reader(io.BytesIO(data), read_across_frames=True) as reader:
+                return bytes(reader.read(most))
+    except (RuntimeError, EOFError, MemoryError, zstandard.ZstdError):
         raise BagError("cannot be decompressed") from None
+    raise BagError(f"is compressed with {compression!r}; known: zstd, lz4")
 
 
 @lru_cache(maxsize=1)

@@ -23,7 +23,8 @@ from typing import IO, cast
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from iwm_power_manager.bags.mcap_records import walk
+from iwm_power_manager.bags.mcap_source import walk
+from iwm_power_manager.bags.metadata import FileSpan
 
 COMPRESSIONS = ("none", "lz4", "zstd")
 _SPAN = struct.Struct("<QQ")
@@ -85,9 +86,9 @@ class McapFile:
             raise
 
     @property
-    def message_count(self) -> int:
-        """Messages in the file."""
-        return self.counts.total()
+    def span(self) -> FileSpan:
+        """Name, log times and number of messages in the file."""
+        return FileSpan(self.path.name, self.start_time_ns, self.end_time_ns, self.counts.total())
 
     def schema_id(self, name: str, encoding: str, data: bytes) -> int:
         """Id of a schema, the same for the same schema."""
@@ -100,18 +101,18 @@ class McapFile:
         """Take whole records; a chunk waits for the index of its messages, which comes next."""
         if self.broken:
             raise OSError(errno.EIO, "an earlier write has failed")
-        if data[:1] == bytes([Opcode.CHUNK]):
-            self._chunk = data
-        elif data:
-            records, self._chunk = self._chunk + data, b""
-            try:
-                if self.size_bytes and os.fstat(self.stream.fileno()).st_nlink == 0:
-                    raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
+        try:
+            if self.size_bytes and os.fstat(self.stream.fileno()).st_nlink == 0:
+                raise FileNotFoundError(errno.ENOENT, "the file was removed while it was being written")
+            if data[:1] == bytes([Opcode.CHUNK]):
+                self._chunk = data
+            elif data:
+                records, self._chunk = self._chunk + data, b""
                 self.append(records)
-            except OSError:
-                self.broken = True
-                raise
-            self._count(records)
+                self._count(records)
+        except OSError:
+            self.broken = True
+            raise
         return len(data)
 
     def tell(self) -> int:

@@ -18,8 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
 from iwm_power_manager.bags.limits import ZSTD_MAGIC, decompress, decompress_file, regular_file
-from iwm_power_manager.bags.mcap_records import MAGIC
-from iwm_power_manager.bags.mcap_source import McapSource
+from iwm_power_manager.bags.mcap_source import MAGIC, McapSource
 from iwm_power_manager.bags.metadata import Topic, read_metadata, text_values
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError

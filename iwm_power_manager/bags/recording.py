@@ -14,10 +14,9 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple
 
 from iwm_power_manager.bags.limits import MESSAGE_OVERHEAD_BYTES
 from iwm_power_manager.bags.metadata import Topic
@@ -49,38 +48,37 @@ class RecordingOptions:
     snapshot_bytes: int = 64 * 1024 * 1024
 
 
-class RecordingStatus(NamedTuple):
+@dataclass
+class RecordingStatus:
     """What a recording has done so far. Counts run over all bags of this recording.
 
     Attributes
     ----------
     state : "recording", "stopped" or "failed"
-    path : bag being written, or the last one ("" before the first)
+    path, bytes_on_disk, files : bag being written, or the last one ("" before the first), its size and files
     written : messages in files
     dropped_queue : messages dropped because the queue was full
     dropped_size : messages larger than the limit
     dropped_error : messages that came, or were in memory, when writing failed
     pending : messages in the queue and in the chunk in memory
     queue_bytes, queue_peak_bytes : memory the queue takes, and the most it took
-    bytes_on_disk : of the current or last bag
-    files : number of files of that bag
     disk_behind_s : what is older than this is on the disk and survives a power cut; 0 when all is, or without `sync`
     error : why the recording failed, one line
     """
 
-    state: str
-    path: str
-    written: int
-    dropped_queue: int
-    dropped_size: int
-    dropped_error: int
-    pending: int
-    queue_bytes: int
-    queue_peak_bytes: int
-    bytes_on_disk: int
-    files: int
-    disk_behind_s: float
-    error: str
+    state: str = STOPPED
+    path: str = ""
+    written: int = 0
+    dropped_queue: int = 0
+    dropped_size: int = 0
+    dropped_error: int = 0
+    pending: int = 0
+    queue_bytes: int = 0
+    queue_peak_bytes: int = 0
+    bytes_on_disk: int = 0
+    files: int = 0
+    disk_behind_s: float = 0.0
+    error: str = ""
 
 
 class Recording:
@@ -104,14 +102,11 @@ class Recording:
         self._announced: list[Topic] = []  # by the writing thread, in the order of their numbers
         self._wake = threading.Condition()
         self._queue: deque[tuple[list[Sample], int] | Callable[[], object]] = deque()
-        self._queue_bytes = self._queue_count = self._queue_peak = 0
-        self._dropped_queue = self._dropped_size = self._dropped_error = 0
-        self._error = ""
-        self._state = STOPPED
+        self._queue_count = 0
+        self._status = RecordingStatus()  # of which `written` counts the bags before the current one
         self._writer: BagWriter | None = None
         self._last: BagWriter | None = None  # the bag being written, or the one before
         self._given = 0  # messages given to the current bag
-        self._written_before = 0  # messages in the bags before it
         self._starts = self._snapshots = 0
         self._memory: deque[Sample] = deque()
         self._memory_bytes = 0
@@ -127,16 +122,17 @@ class Recording:
     def put(self, samples: list[Sample]) -> None:
         """Hand over messages in the order of their log times, and their list; never blocks."""
         size = _size(samples)
+        status = self._status
         with self._wake:
-            while samples and self._queue_bytes + size > self.options.queue_bytes:
+            while samples and status.queue_bytes + size > self.options.queue_bytes:
                 size -= _size([samples.pop()])
-                self._dropped_queue += 1
+                status.dropped_queue += 1
             if not samples:
                 return
             self._queue.append((samples, size))
-            self._queue_bytes += size
+            status.queue_bytes += size
             self._queue_count += len(samples)
-            self._queue_peak = max(self._queue_peak, self._queue_bytes)
+            status.queue_peak_bytes = max(status.queue_peak_bytes, status.queue_bytes)
             self._wake.notify()
 
     # --- called by anyone -------------------------------------------------------------------------------------------
@@ -155,13 +151,7 @@ class Recording:
             self._enqueue(lambda: self._add_custom_data(values))
 
     def start(self) -> Path:
-        """Begin a bag; returns its path.
-
-        Raises
-        ------
-        BagError
-            One is being recorded already, or the bag cannot be created.
-        """
+        """Begin a bag; returns its path. `BagError` if one is being recorded already, or it cannot be created."""
         return self.call(self._start)
 
     def stop(self) -> Path:
@@ -177,13 +167,7 @@ class Recording:
         return self.call(self._snapshot)
 
     def close(self) -> None:
-        """Write what is queued, close the bag if there is one, end the thread.
-
-        Raises
-        ------
-        BagError
-            The bag could not be closed properly.
-        """
+        """Write what is queued, close the bag if there is one, end the thread; `BagError` if it could not be closed."""
         if not self._thread.is_alive():
             return
         try:
@@ -200,20 +184,14 @@ class Recording:
         with self._wake:
             writer, last, until = self._writer, self._last, self._on_disk_until
             written = writer.message_count if writer else 0
-            return RecordingStatus(
-                state=self._state,
+            return replace(
+                self._status,
                 path=str(last.path) if last else "",
-                written=self._written_before + written,
-                dropped_queue=self._dropped_queue,
-                dropped_size=self._dropped_size,
-                dropped_error=self._dropped_error,
+                written=self._status.written + written,
                 pending=max(self._given - written, 0) + self._queue_count,
-                queue_bytes=self._queue_bytes,
-                queue_peak_bytes=self._queue_peak,
                 bytes_on_disk=last.size_bytes if last else 0,
                 files=last.file_count if last else 0,
                 disk_behind_s=0.0 if until is None else time.monotonic() - until,
-                error=self._error,
             )
 
     # --- the writing thread -----------------------------------------------------------------------------------------
@@ -244,13 +222,14 @@ class Recording:
         while True:
             with self._wake:
                 if not self._queue and not self._closing:
-                    self._wake.wait(self._until_flush())
+                    until_flush = max(0.0, self._next_flush - time.monotonic())
+                    self._wake.wait(until_flush if self._writer is not None else None)
                 item = self._queue.popleft() if self._queue else None
                 if item is None and self._closing:
                     return
                 if isinstance(item, tuple):
                     self._queue_count -= len(item[0])
-                    self._queue_bytes -= item[1]
+                    self._status.queue_bytes -= item[1]
             try:
                 if isinstance(item, tuple):
                     self._take(*item)
@@ -261,14 +240,11 @@ class Recording:
             except Exception as error:  # noqa: BLE001 - a fault here must end as a failed recording, not in silence
                 self._fail(error)
 
-    def _until_flush(self) -> float | None:
-        return max(0.0, self._next_flush - time.monotonic()) if self._writer is not None else None
-
     def _take(self, samples: list[Sample], size: int) -> None:
         if self.options.snapshot_s > 0.0:
             self._remember(samples, size)
         if self._writer is None:
-            self._dropped_error += len(samples) if self._state == FAILED else 0
+            self._status.dropped_error += len(samples) if self._status.state == FAILED else 0
             return
         self._given += len(samples)
         remaining = iter(samples)
@@ -278,8 +254,8 @@ class Recording:
                 return
             except MessageTooLarge as error:
                 self._given -= 1
-                self._dropped_size += 1
-                self._error = str(error)
+                self._status.dropped_size += 1
+                self._status.error = str(error)
 
     def _flush(self, writer: BagWriter) -> None:
         """Bring what was given into the file, and have the disk take it, in a thread of its own.
@@ -304,17 +280,17 @@ class Recording:
         if writer is not None:
             with suppress(BagError):
                 writer.close()
-            self._dropped_error += self._given - writer.message_count
+            self._status.dropped_error += self._given - writer.message_count
             self._leave(writer)
-        self._error = str(error) if isinstance(error, BagError) else f"internal error: {error!r}"
-        self._state = FAILED
+        self._status.error = str(error) if isinstance(error, BagError) else f"internal error: {error!r}"
+        self._status.state = FAILED
         self.failed.set()
 
     def _leave(self, writer: BagWriter) -> None:
         with self._wake:
-            self._state = STOPPED
+            self._status.state = STOPPED
             self._on_disk_until = None
-            self._written_before += writer.message_count
+            self._status.written += writer.message_count
             self._given = 0
             self._writer = None
 
@@ -346,13 +322,14 @@ class Recording:
         self._next_flush = time.monotonic() + self.options.flush_period_s
         with self._wake:
             self._writer = self._last = writer
-            self._state, self._error = RECORDING, ""
+            self._status.state, self._status.error = RECORDING, ""
             self._on_disk_until = time.monotonic() if self.options.sync else None
         return path
 
     def _recorded(self) -> BagWriter:
         if self._writer is None:
-            raise BagError("nothing is being recorded" + (f": {self._error}" if self._state == FAILED else ""))
+            why = f": {self._status.error}" if self._status.state == FAILED else ""
+            raise BagError(f"nothing is being recorded{why}")
         return self._writer
 
     def _stop(self) -> Path:

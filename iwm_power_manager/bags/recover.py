@@ -25,17 +25,17 @@ from mcap.records import Attachment, Metadata
 
 from iwm_power_manager.bags.limits import ZSTD_MAGIC, regular_file
 from iwm_power_manager.bags.mcap_file import McapFile
-from iwm_power_manager.bags.mcap_records import (
+from iwm_power_manager.bags.mcap_source import (
     FIRST_PRIVATE,
     UNREADABLE,
     ChannelMessage,
     Definitions,
+    McapSource,
     Record,
     read_record,
     split,
     walk,
 )
-from iwm_power_manager.bags.mcap_source import McapSource
 from iwm_power_manager.bags.metadata import FileSpan, Topic, read_metadata, text_values
 from iwm_power_manager.bags.reader import (
     COMPRESSED_SUFFIX,

@@ -29,7 +29,7 @@ from iwm_power_manager.bags.limits import (
     SQLITE_INSTRUCTIONS_PER_BYTE,
     regular_file,
 )
-from iwm_power_manager.bags.mcap_records import ChannelMessage
+from iwm_power_manager.bags.mcap_source import ChannelMessage
 from iwm_power_manager.bags.metadata import Topic, parse_qos
 from iwm_power_manager.errors import BagError
 

@@ -19,7 +19,7 @@ from typing import Self
 
 from iwm_power_manager import __version__
 from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
-from iwm_power_manager.bags.mcap_records import MESSAGE_OVERHEAD_BYTES
+from iwm_power_manager.bags.mcap_source import RECORD_OVERHEAD_BYTES
 from iwm_power_manager.bags.metadata import (
     CUSTOM_METADATA,
     METADATA_FILE,
@@ -102,16 +102,15 @@ class BagWriter:
     ) -> None:
         self.path = Path(path)
         self.options = options or WriterOptions()
+        self.custom_data = dict(custom_data or {})
         self._disk = disk
         self._disk_work: deque[Future[None]] = deque()
-        self.custom_data = dict(custom_data or {})
         self._topics: list[Topic] = []
         self._counts: list[int] = []
         self._channels: list[int] = []
         self._spans: list[FileSpan] = []
         self._closed = False
         self._closed_bytes = 0
-        self._largest = self.options.max_message_bytes
         self._splits = self.options.max_bytes > 0 or self.options.max_duration_ns > 0
         self._fill = (0, 0)  # how large the file was, and what has been given to it since
         self._file_start_ns: int | None = None  # log time of its first message
@@ -143,7 +142,7 @@ class BagWriter:
     @property
     def message_count(self) -> int:
         """Messages on disk; those of the chunk in memory are not counted yet."""
-        return sum(span.message_count for span in self._spans) + (self._file.message_count if self._file else 0)
+        return sum(span.message_count for span in self._spans) + (self._file.counts.total() if self._file else 0)
 
     @property
     def file_count(self) -> int:
@@ -174,7 +173,7 @@ class BagWriter:
     def write_all(self, samples: Iterator[Sample]) -> None:
         """Write messages. After `MessageTooLarge` the iterator stands behind the one that was refused."""
         watched = self._splits or self._file_start_ns is None
-        add, channels, largest = self._add, self._channels, self._largest
+        add, channels, largest = self._add, self._channels, self.options.max_message_bytes
         with self._failing():
             for topic, log_time_ns, data, publish_time_ns, sequence in samples:
                 if watched or len(data) > largest:
@@ -186,10 +185,10 @@ class BagWriter:
     def _prepare(self, topic: int, log_time_ns: int, size: int) -> None:
         """Refuse a message that is too large; begin the next file, if the present one is full or old enough."""
         options, file = self.options, self._open
-        if size > self._largest:
+        if size > options.max_message_bytes:
             raise MessageTooLarge(
                 f"{self.path}: {self._topics[topic].name}: a message of {size} bytes was not written; "
-                f"allowed: <= {self._largest}"
+                f"allowed: <= {options.max_message_bytes}"
             )
         given = self._fill[1] if self._fill[0] == file.size_bytes else 0
         if self._file_start_ns is not None and (
@@ -198,7 +197,7 @@ class BagWriter:
         ):
             self.split()
             file, given = self._open, 0
-        self._fill = (file.size_bytes, given + MESSAGE_OVERHEAD_BYTES + size)
+        self._fill = (file.size_bytes, given + RECORD_OVERHEAD_BYTES + size)
         if self._file_start_ns is None:
             self._file_start_ns = log_time_ns
 
@@ -215,6 +214,7 @@ class BagWriter:
                 self._on_disk(partial(_sync_file, self._open.path, then))
 
     def _on_disk(self, work: Callable[[], None]) -> None:
+        """Have work done by whoever waits for the disk."""
         if self._disk is None:
             work()
         else:
@@ -299,7 +299,7 @@ class BagWriter:
             self._file = self._file_start_ns = None
             for index, channel in enumerate(self._channels):
                 self._counts[index] += file.counts[channel]
-            self._spans.append(span_of(file))
+            self._spans.append(file.span)
             self._closed_bytes += file.size_bytes
 
 
@@ -331,14 +331,9 @@ def finish(file: McapFile, channels: Sequence[tuple[Topic, int]], custom_data: M
     """Complete a file with the metadata rosbag2 keeps inside, and close it; the disk may still have to take it."""
     file.writer.flush()
     counts = [(topic, file.counts[channel]) for topic, channel in channels]
-    information = bag_information("mcap", [span_of(file)], counts, custom_data)
+    information = bag_information("mcap", [file.span], counts, custom_data)
     file.writer.add_metadata("rosbag2", {"serialized_metadata": yaml_text(information)})
     file.finish(sync=False)
-
-
-def span_of(file: McapFile) -> FileSpan:
-    """Time span and count of what is in a file."""
-    return FileSpan(file.path.name, file.start_time_ns, file.end_time_ns, file.message_count)
 
 
 def write_metadata(

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -302,7 +303,7 @@ class Recorder(Node):
             level, text = DiagnosticStatus.WARN, f"{status.state}; waiting for {CLOCK}"
         else:
             level, text = DiagnosticStatus.OK, status.state
-        values = {**status._asdict(), "lost": lost, "topics": len(counts), "ready": self._ready}
+        values = {**asdict(status), "lost": lost, "topics": len(counts), "ready": self._ready}
         for name, (taken, missing, missed) in counts.items():
             values[name] = f"{taken} taken, {missing} lost, {missed} before the first"
         message = DiagnosticArray()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,7 +20,10 @@ from numpy.typing import NDArray
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.errors import BagError
+from iwm_power_manager.mdp.demand import Source, signal_source
+from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.signals.mapping import DEMANDS, PEDALS, SignalMapping, load_mapping, topic_named
@@ -33,6 +37,7 @@ from iwm_power_manager.signals.readings import (
     topic_readers,
 )
 from iwm_power_manager.signals.types import Types, types_of
+from iwm_power_manager.vehicle import Vehicle
 
 #: Messages from a bag's start that show whether its stamps advance, and how many may have the same one.
 _PROBE_MESSAGES = 2000
@@ -78,6 +83,10 @@ class RecordedDrive(NamedTuple):
     speed_mps: FloatArray
     bad_messages: int
     damage: list[str]
+
+    def source(self, name: str, problem: Problem, weight: float) -> Source:
+        """The drive as a source of demand for the solver."""
+        return signal_source(name, self.time_s, self.power_demand_w, problem.dt_s, weight, self.speed_mps)
 
 
 class SignalStream:
@@ -253,12 +262,8 @@ def read_signal(
         The bag cannot be read, or holds no demand or no speed.
     """
     mapping = mapping or load_mapping()
-    log_times: list[int] = []
-    stamps: list[int] = []
-    demands: list[float] = []
-    speeds: list[float] = []
-    speed = math.nan
-    stamp = -1
+    rows: list[tuple[int, int, float, float]] = []  # log time, stamp of the speed, demand, speed
+    speed, stamp = math.nan, -1
     with BagReader(bag) as reader:
         stream = SignalStream(reader, mapping, vehicle, ("speed", *DEMANDS, *PEDALS))
         check_signals(reader, mapping, stream)
@@ -267,31 +272,41 @@ def read_signal(
                 speed = reading.speed_mps
                 stamp = reading.stamp_ns if stamped else -1
             elif isinstance(reading, DemandReading) and not math.isnan(speed):
-                log_times.append(log_time_ns)
-                stamps.append(stamp)
-                demands.append(reading.power_w)
-                speeds.append(speed)
-        damage = reader.damage
-        bad = stream.bad_messages
-        damage = [*damage, *stream.problems]
-    if not demands:
+                rows.append((log_time_ns, stamp, reading.power_w, speed))
+        damage = [*reader.damage, *stream.problems]
+    if not rows:
         raise BagError(f"{bag}: holds no power demand with a speed before it")
-    time_ns = _times(np.array(log_times, dtype=np.int64), np.array(stamps, dtype=np.int64))
+    log_times, stamps, demands, speeds = map(np.array, zip(*rows, strict=True))
+    time_ns = _times(log_times, stamps)
     keep = _advancing(time_ns)
     time_s = (time_ns[keep] - time_ns[keep[0]]) * 1e-9
-    return RecordedDrive(time_s, np.array(demands)[keep], np.array(speeds)[keep], bad, damage)
+    return RecordedDrive(time_s, demands[keep], speeds[keep], stream.bad_messages, damage)
+
+
+def read_drives(
+    bags: Sequence[str], mapping: str | None, vehicle: Vehicle, command: str
+) -> list[tuple[str, RecordedDrive]]:
+    """Name and content of recorded drives; what is wrong with them goes to stderr in the name of a command."""
+    known = load_mapping(resolve(mapping) if mapping else None) if bags else None
+    drives = [(path, read_signal(path, known, vehicle.params)) for path in bags]
+    for path, drive in drives:
+        bad = [f"{drive.bad_messages} bad messages left out"] if drive.bad_messages else []
+        for line in (*drive.damage, *bad):
+            print(f"{command}: warning: {path}: {line}", file=sys.stderr)
+    return [(Path(path).name, drive) for path, drive in drives]
 
 
 def check_signals(reader: BagReader, mapping: SignalMapping, stream: SignalStream, wheels: bool = False) -> None:
     """Refuse a bag without speed or demand, or with `wheels` without wheel speeds; the line says what it holds."""
     held = ", ".join(sorted(reader.topics)) or "no topic"
     held += "".join(f"; {problem}" for problem in stream.problems)
-    if "speed" not in stream.signals:
-        raise BagError(f"{reader.path}: holds no topic that {mapping.path} maps to speed; it holds {held}")
+    lacking = ["speed"] if "speed" not in stream.signals else []
     if not stream.signals.intersection(DEMANDS) and not stream.signals.issuperset(PEDALS):
-        raise BagError(f"{reader.path}: holds no topic that {mapping.path} maps to power_demand; it holds {held}")
+        lacking.append("power_demand")
     if wheels and "wheel_speed" not in stream.signals:
-        raise BagError(f"{reader.path}: holds no topic that {mapping.path} maps to wheel_speed; it holds {held}")
+        lacking.append("wheel_speed")
+    if lacking:
+        raise BagError(f"{reader.path}: holds no topic that {mapping.path} maps to {lacking[0]}; it holds {held}")
 
 
 def _advancing(time_ns: NDArray[np.int64]) -> NDArray[np.intp]:

@@ -39,7 +39,7 @@ from iwm_power_manager.mdp.transitions import build_model
 from iwm_power_manager.model.feasible import trace_warnings
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.policy import load_policy
-from iwm_power_manager.replay.demand import drive_source, read_drives
+from iwm_power_manager.replay.recorded import read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
 from iwm_power_manager.tools.command import described, ended, picture, write_json
@@ -235,7 +235,7 @@ def _doubts(cycles: Sequence[Cycle], vehicle: Vehicle, frictions: Sequence[float
 def _sources(options: argparse.Namespace, cycles: Sequence[Cycle], problem: Problem, vehicle: Vehicle) -> list[Source]:
     sources = [source_of(cycle, problem, vehicle.params) for cycle in cycles]
     drives = read_drives(options.bag, options.mapping, vehicle, "solve_policy")
-    sources += [drive_source(name, drive, problem, options.bag_weight) for name, drive in drives]
+    sources += [drive.source(name, problem, options.bag_weight) for name, drive in drives]
     return sources + [transitions_source(path, problem.dt_s, options.bag_weight) for path in options.transitions]
 
 

@@ -22,7 +22,7 @@ from iwm_power_manager.files import check_number
 from iwm_power_manager.mdp.demand import source_of
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.policy import save_policy
-from iwm_power_manager.replay.demand import drive_source, read_drives
+from iwm_power_manager.replay.recorded import read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import load_grid, targets
 from iwm_power_manager.tools.command import described, ended, write_json
@@ -135,7 +135,7 @@ def _learn(options: argparse.Namespace) -> None:
     paths = targets(Path(options.output), vehicle, problem, frictions)
     general = tuple(source_of(load_cycle(resolve(name)), problem, vehicle.params) for name in options.cycle or CYCLES)
     recordings = read_drives(options.bag, options.mapping, vehicle, "learn_policy")
-    recorded = tuple(drive_source(name, drive, problem, 1.0) for name, drive in recordings)
+    recorded = tuple(drive.source(name, problem, 1.0) for name, drive in recordings)
     drives = tuple(
         [load_cycle(resolve(name)) for name in options.drive]
         if options.drive

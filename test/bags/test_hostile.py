@@ -19,7 +19,7 @@ from mcap.records import Chunk
 
 import foreign_bags as foreign
 from iwm_power_manager.bags import limits
-from iwm_power_manager.bags.mcap_records import MAGIC
+from iwm_power_manager.bags.mcap_source import MAGIC
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.errors import BagError

@@ -74,9 +74,9 @@ def test_a_file_without_messages_is_valid(tmp_path: Path) -> None:
 
 def test_everything_flushed_is_readable_from_the_unfinished_file(tmp_path: Path) -> None:
     file = fill(tmp_path / "a.mcap", 500)
-    assert file.message_count == 0
+    assert file.counts.total() == 0
     file.writer.flush()
-    assert (file.message_count, file.start_time_ns, file.end_time_ns) == (500, 1000, 1499)
+    assert (file.counts.total(), file.start_time_ns, file.end_time_ns) == (500, 1000, 1499)
     with (tmp_path / "a.mcap").open("rb") as stream:
         count = 0
         with pytest.raises(Exception, match=r".*"):  # mcap has several for a missing end
@@ -122,7 +122,7 @@ def test_a_half_written_chunk_is_cut_off_and_what_was_written_before_is_whole(
     with pytest.raises(OSError, match="No space left"):
         file.writer.flush()
     monkeypatch.setattr(file, "stream", stream)
-    assert (file.message_count, file.broken) == (100, True)
+    assert (file.counts.total(), file.broken) == (100, True)
     with pytest.raises(OSError, match="an earlier write has failed"):
         file.writer.flush()
     file.abandon()

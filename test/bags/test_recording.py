@@ -207,7 +207,7 @@ def test_a_full_disk_ends_the_recording_with_every_message_accounted_for(tmp_pat
 
 #: Records until the disk is full; then reads, recovers elsewhere, makes room, and records again. Says what happened.
 FULL_DISK_CHILD = """
-import json, sys
+import dataclasses, json, sys
 from pathlib import Path
 import shutil
 from bags_helpers import float64, topic
@@ -244,7 +244,8 @@ shutil.rmtree(disk / "bag")
 again = recording.start()
 recording.put([(0, i, float64(i), i, i + 1) for i in range(5)])
 recording.close()
-print(json.dumps({"put": put, "status": status._asdict(), "read": read, "refused": refused, "again": values(again)}))
+status = dataclasses.asdict(status)
+print(json.dumps({"put": put, "status": status, "read": read, "refused": refused, "again": values(again)}))
 """
 
 

@@ -16,7 +16,7 @@ from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.mdp.demand import chain_of, cycle_power_w, cycle_source, driven_source
 from iwm_power_manager.mdp.problem import load_problem
 from iwm_power_manager.policy import load_policy, load_policy_bank, policy_bytes
-from iwm_power_manager.replay import demand
+from iwm_power_manager.replay import recorded as recorded_drives
 from iwm_power_manager.replay.recorded import RecordedDrive
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools import solve_policy
@@ -208,7 +208,7 @@ def recorded(monkeypatch):
     car = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
     power = np.repeat(cycle_power_w(load_cycle(share_path("config/cycles/nycc.csv")), 0.1, car), 10)
     drive = RecordedDrive(0.01 * np.arange(power.size), power, np.zeros(power.size), 3, ["file 2 ends early"])
-    monkeypatch.setattr(demand, "read_signal", lambda bag, mapping, vehicle: drive)
+    monkeypatch.setattr(recorded_drives, "read_signal", lambda bag, mapping, vehicle: drive)
     return drive
 
 
