@@ -63,8 +63,8 @@ _FOOTER_BYTES = 20
 _CHUNK_BEGIN = re.compile(b"\x06.{5}\\0\\0\\0.{28}(?:\\0\\0\\0\\0|\x03\\0\\0\\0lz4|\x04\\0\\0\\0zstd)", re.DOTALL)
 
 FIRST_PRIVATE = 0x80
-#: Records outside of chunks that are read to see whether they are what they say.
-KINDS: dict[int, Any] = {
+#: Records outside of chunks that are read where they are met: so one sees whether they are what they say.
+_KINDS: dict[int, Any] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
@@ -84,12 +84,13 @@ _NEVER = 2**64
 
 
 class Record(NamedTuple):
-    """Where a record is: its first byte, its content's, and the one behind it."""
+    """Where a record is: its first byte, its body's, and the one behind it; and of some kinds what it says."""
 
     opcode: int
     start: int
     body: int
     end: int
+    content: Any = None
 
 
 #: A message: log time, channel's number, bytes, publish time, sequence.
@@ -99,10 +100,7 @@ ChannelMessage = tuple[int, int, bytes, int, int]
 def walk(data: Bytes, offset: int = len(MAGIC)) -> Iterator[Record]:
     """All records from `offset` to the footer; `UNREADABLE` for a stretch that holds none.
 
-    Raises
-    ------
-    BagError
-        There are more than any honest file has.
+    `BagError`: there are more than any honest file has.
     """
     size = len(data)
     for _ in range(MAX_RECORDS):
@@ -126,9 +124,8 @@ def _record_at(data: Bytes, offset: int) -> Record | None:
         return None
     record = Record(opcode, offset, body, body + length)
     try:
-        if opcode in KINDS:
-            read_record(KINDS[opcode], data, record)
-            return record
+        if opcode in _KINDS:
+            return record._replace(content=_read(_KINDS[opcode], data, record))
         return record if _stated_length(data, opcode, body, length) == length else None
     except (BagError, struct.error):
         return None
@@ -159,12 +156,9 @@ class Definitions:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
 
-    def take(self, data: Bytes, record: Record) -> None:
-        """Read a schema's or a channel's record; `BagError` if it cannot be."""
-        if record.opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
-            return
-        known: dict[int, Any] = self.schemas if record.opcode == Opcode.SCHEMA else self.channels
-        found = read_record(KINDS[record.opcode], data, record)
+    def take(self, found: Schema | Channel) -> None:
+        """Add one; the first of a number counts. `BagError` if there are too many."""
+        known: dict[int, Any] = self.schemas if isinstance(found, Schema) else self.channels
         known.setdefault(found.id, found)
         if len(known) > MAX_CHANNELS:
             raise BagError(f"holds more than {MAX_CHANNELS} channels")
@@ -174,7 +168,7 @@ class Definitions:
         return self.schemas.get(channel.schema_id) or Schema(id=0, data=b"", encoding="", name="")
 
 
-def read_record(kind: Any, data: Bytes, record: Record) -> Any:
+def _read(kind: Any, data: Bytes, record: Record) -> Any:
     """A record as the `mcap` package reads it; `BagError` if its content is none, or has another length."""
     stream = ReadDataStream(BytesIO(data[record.body : record.end]))
     try:
@@ -204,7 +198,8 @@ def split(raw: bytes, definitions: Definitions) -> list[ChannelMessage]:
             end = offset + HEAD_BYTES + length
             if end > size or opcode == UNREADABLE:
                 break
-            definitions.take(raw, Record(opcode, offset, offset + HEAD_BYTES, end))
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                definitions.take(_read(_KINDS[opcode], raw, Record(opcode, offset, offset + HEAD_BYTES, end)))
         offset = end
     if len(messages) > MAX_CHUNK_MESSAGES:
         raise BagError(f"holds more than {MAX_CHUNK_MESSAGES} messages")
@@ -300,22 +295,25 @@ class McapSource:
         statistics: Statistics | None = None
         record = None
         for record in walk(self.data):
+            found = record.content
             if record.opcode == Opcode.CHUNK:
                 self._pieces.append(Piece(_SPAN.unpack_from(self.data, record.body)[0], record))
             elif record.opcode == Opcode.MESSAGE:
                 self._add_to_run(record)
-            elif record.opcode == Opcode.METADATA:
-                found = read_record(Metadata, self.data, record)
-                self.metadata.setdefault(found.name, {}).update(found.metadata)
-            elif record.opcode == Opcode.STATISTICS:
-                statistics = read_record(Statistics, self.data, record)
-            elif record.opcode == Opcode.HEADER:
-                self.header = read_record(Header, self.data, record)
             elif record.opcode == UNREADABLE and record.end < len(self.data):
                 self.note(f"holds no record from byte {record.start} to {record.end}")
                 statistics = None
-            else:
-                self._take_definition(record)
+            elif isinstance(found, Metadata):
+                self.metadata.setdefault(found.name, {}).update(found.metadata)
+            elif isinstance(found, Statistics):
+                statistics = found
+            elif isinstance(found, Header):
+                self.header = found
+            elif isinstance(found, Schema | Channel):
+                try:
+                    self.definitions.take(found)
+                except BagError as error:
+                    self.note(f"{error} at byte {record.start}")
         if record is None or record.opcode != Opcode.FOOTER or self.data[record.end :] != MAGIC:
             self.note("ends without a footer: the recorder did not finish it")
             return None
@@ -332,12 +330,6 @@ class McapSource:
             record = last._replace(end=record.end)
             self._pieces.pop()
         self._pieces.append(Piece(0, record))
-
-    def _take_definition(self, record: Record) -> None:
-        try:
-            self.definitions.take(self.data, record)
-        except BagError as error:
-            self.note(f"{error} at byte {record.start}")
 
     def _open_all(self) -> None:
         """Look into every chunk: channels may be announced there and nowhere else, and its head may be wrong."""
@@ -396,7 +388,7 @@ class McapSource:
 
     def raw(self, record: Record) -> bytes:
         """Content of a chunk; `BagError` if it is damaged or too large."""
-        chunk: Chunk = read_record(Chunk, self.data, record)
+        chunk: Chunk = _read(Chunk, self.data, record)
         raw = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
         if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:
             raise BagError("is damaged: its checksum is wrong")

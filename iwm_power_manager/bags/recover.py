@@ -32,7 +32,6 @@ from iwm_power_manager.bags.mcap_source import (
     Definitions,
     McapSource,
     Record,
-    read_record,
     split,
     walk,
 )
@@ -58,9 +57,8 @@ class FileRecovery(NamedTuple):
 
     Attributes
     ----------
-    name : file name
+    name, message_count : the file, and messages in it now
     rebuilt : it was written anew
-    message_count : messages in it now
     damage : what was wrong with it; "" for a whole file
     discarded_bytes : torn bytes at its end
     lost_chunks : chunks, or stretches of the file, that could not be read
@@ -340,7 +338,7 @@ class _Copy:
             )
 
     def _take(self, source: McapSource, record: Record) -> None:
-        data, writer = source.data, self._file.writer
+        data, found, writer = source.data, record.content, self._file.writer
         if record.opcode == Opcode.CHUNK:
             try:
                 self._write(split(source.raw(record), Definitions()))
@@ -348,12 +346,10 @@ class _Copy:
                 self.lost += 1
         elif record.opcode == Opcode.MESSAGE:
             self._write(split(data[record.start : record.end], Definitions()))
-        elif record.opcode == Opcode.ATTACHMENT:
-            found: Attachment = read_record(Attachment, data, record)
+        elif isinstance(found, Attachment):
             writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
-        elif record.opcode == Opcode.METADATA:
-            metadata: Metadata = read_record(Metadata, data, record)
-            writer.add_metadata(metadata.name, metadata.metadata)
+        elif isinstance(found, Metadata):
+            writer.add_metadata(found.name, found.metadata)
         elif record.opcode >= FIRST_PRIVATE:
             self._file.write(data[record.start : record.end])
         elif record.opcode == UNREADABLE and record.end < len(data):

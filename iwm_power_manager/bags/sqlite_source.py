@@ -143,20 +143,14 @@ class SqliteSource:
 
     def _read_topics(self) -> None:
         for row in self._database.execute("SELECT * FROM topics"):
-            found = dict(zip(row.keys(), row, strict=True))
-            msgtype, serialization = found["type"], found.get("serialization_format", "cdr")
-            if not (isinstance(msgtype, str) and isinstance(serialization, str) and isinstance(found["name"], str)):
+            found = {"serialization_format": "cdr", **dict(zip(row.keys(), row, strict=True))}
+            described = [found[key] for key in ("name", "type", "serialization_format")]
+            if not all(isinstance(text, str) for text in described):
                 self.note(f"topic {found['id']} is described by something else than text")
-            encoding, text = self._definitions.get(str(msgtype), ("", ""))
-            self._topics[found["id"]] = Topic(
-                str(found["name"]),
-                str(msgtype),
-                text,
-                str(found.get("type_description_hash") or ""),
-                parse_qos(str(found.get("offered_qos_profiles") or "")),
-                encoding,
-                str(serialization),
-            )
+            name, msgtype, serialization = map(str, described)
+            encoding, text = self._definitions.get(msgtype, ("", ""))
+            type_hash, qos = (str(found.get(key) or "") for key in ("type_description_hash", "offered_qos_profiles"))
+            self._topics[found["id"]] = Topic(name, msgtype, text, type_hash, parse_qos(qos), encoding, serialization)
 
     def _count(self) -> None:
         """Messages by topic, if the file is whole: each page of it is looked at."""

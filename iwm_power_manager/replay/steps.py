@@ -325,46 +325,44 @@ class ReconstructedSteps:
 
     def take(self, values: Sequence[Recorded]) -> list[ReplayedStep]:
         """The readings of one message; returns the steps they cause."""
-        steps = []
+        steps: list[ReplayedStep] = []
         for value in values:
-            topic = _TOPICS.get(type(value.reading))
-            if topic is not None:
-                reading: Any = value.reading
-                content = reading[1] if topic in (DEMAND, FRICTION) else reading
-                steps += (self._push if self.in_sets else self._use)(topic, content, reading.stamp_ns, value)
+            reading: Any = value.reading
+            topic = _TOPICS.get(type(reading))
+            if topic == FRICTION:
+                self._friction(reading.friction, reading.stamp_ns)
+            elif topic is not None:
+                content = reading.power_w if topic == DEMAND else reading
+                taken = (self._push if self.in_sets else self._use)(topic, content, reading.stamp_ns, value)
+                steps += [step for one in taken for step in self._replayed(one, value)]
         return steps
 
-    def _push(self, topic: str, content: object, now_ns: int, value: Recorded) -> list[ReplayedStep]:
+    def _push(self, topic: str, content: Any, now_ns: int, value: Recorded) -> Iterable[Taken]:
         """Lock-step: collect a set, step when it is complete."""
         queue = self._lockstep.queue
         if topic == DEMAND:
             queue.push_demand(value.publish_time_ns, content)
-        elif topic == FRICTION:
-            self._friction(content, now_ns)
         else:
             kind = {SPEED: lockstep.SPEED, WHEELS: lockstep.WHEELS, BATTERY: lockstep.BATTERY}[topic]
             queue.push(kind, now_ns, value.publish_time_ns, content)
-        return [step for taken in self._lockstep.steps() for step in self._replayed(taken, value)]
+        return self._lockstep.steps()
 
-    def _use(self, topic: str, content: object, now_ns: int, value: Recorded) -> list[ReplayedStep]:
+    def _use(self, topic: str, content: Any, now_ns: int, _: Recorded) -> Iterable[Taken]:
         """Not in sets: keep the latest of everything, step at the wheel speeds."""
         monitor = self._controller.monitor
         if topic == SPEED:
-            monitor.take_speed(content, now_ns)  # type: ignore[arg-type]
+            monitor.take_speed(content, now_ns)
         elif topic == BATTERY:
-            monitor.take_battery(content, now_ns)  # type: ignore[arg-type]
+            monitor.take_battery(content, now_ns)
         elif topic == DEMAND:
-            monitor.take_demand(content, 0.0, now_ns)  # type: ignore[arg-type]
-        elif topic == FRICTION:
-            self._friction(content, now_ns)
-        else:
-            taken = self._recorded.step(content, now_ns)
-            return self._replayed(taken, value) if taken is not None else []
+            monitor.take_demand(content, 0.0, now_ns)
+        elif (taken := self._recorded.step(content, now_ns)) is not None:
+            return [taken]
         return []
 
-    def _friction(self, content: object, now_ns: int) -> None:
+    def _friction(self, friction: float, now_ns: int) -> None:
         controller = self._controller
-        if self._plan.keeps_friction and controller.monitor.take_friction(content, now_ns):  # type: ignore[arg-type]
+        if self._plan.keeps_friction and controller.monitor.take_friction(friction, now_ns):
             controller.friction = controller.monitor.friction
             controller.policy = self._plan.policies.table(self._plan.settings.strategy, controller.friction)
 
