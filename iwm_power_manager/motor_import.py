@@ -13,8 +13,18 @@ from iwm_power_manager.motor_map import COLUMNS, RANGES
 from iwm_power_manager.tables import Table, read_table
 
 RAD_S_PER_RPM = 2.0 * math.pi / 60.0
-_SPEED_NAMES = {"rpm": r"rpm|1/min|min-1|min\^-1|u/min", "rad/s": r"rad_?/?s\b|rad_?per_?s|radps"}
-_NOTHING = ("", "nan", "-", "n/a", "na", "null", "none", "inf")
+_SPEED_NAMES = {"rpm": r"\brpm|1/min|min-1|min\^-1|u/min", "rad/s": r"rad_?/?s\b|rad_?per_?s|radps"}
+_NOTHING = ("", "nan", "-", "n/a", "na", "null", "none", "inf", "n.a.", "k.a.")
+#: Units that are not read, by what the option that settles it is.
+_OTHER_UNITS = {
+    "speeds": (r"km/?h|\bkph|\bmph|\bm/s|\bkrpm|\brps|\b1/s|\bs\^?-1|\bhz\b|(deg|°)/s", "rad/s or rpm: --speed-unit"),
+    "torques": (r"\b[km]n[ ·*]?m\b|\blbf?|\bft\b|\boz", "N m"),
+    "losses": (r"\b[km]w\b", "W"),
+}
+#: What the head of a column says of it.
+_TORQUE, _SPEED = re.compile("torque|moment|n ?m", re.I), re.compile("speed|drehzahl|rpm|min|rad|omega", re.I)
+#: A map with so few of its grid's points is on no grid.
+_SPARSE = 0.25
 
 
 class Points(NamedTuple):
@@ -41,10 +51,10 @@ def read_points(
 
     Parameters
     ----------
-    layout : list (speed, torque, value in each row), matrix (speeds down, torques across, or `down` = "torque" the
-        other way round), or auto: three columns are a list
+    layout : list (speed, torque, value in each row; torque first if the header says so), matrix (speeds down, torques
+        across, or `down` = "torque" the other way round), or auto: three columns are a list
     speed_unit : rad/s, rpm, or auto: as the header says, else rad/s
-    percent : whether efficiencies are in percent; None: if one is above 1.5
+    percent : whether efficiencies are in percent; None: if most are above 1.5
     quantity : efficiency, or loss in W
     gear : turns of the motor for one of the wheel: the result is the wheel's
 
@@ -53,32 +63,31 @@ def read_points(
     ConfigError
         What is no number, stands twice, or is out of range, with its line.
     """
-    table = read_table(path, separator, decimal)
+    table = _trimmed(read_table(path, separator, decimal))
     said = ["decimal commas"] if table.decimal == "," else []
     guessed = layout == "auto"
+    columns = len(table.rows[-1][1])
     if guessed:
-        layout = "list" if len(table.rows[-1][1]) == 3 else "matrix"
-        said.append(f"layout {layout}: it has {len(table.rows[-1][1])} columns")
+        layout = "list" if columns == 3 else "matrix"
+        said.append(f"layout {layout}: it has {columns} columns" + (f"; {down}s down" if layout == "matrix" else ""))
     if layout == "list" and down != "speed":
         raise ConfigError("arguments", "--down", f"has no effect: {path} is read as a list", "--layout matrix with it")
-    header = " ".join(table.rows[0][1])
-    named = next((unit for unit, names in _SPEED_NAMES.items() if re.search(names, header, re.IGNORECASE)), "")
-    doubts = []
-    if speed_unit == "auto":
-        speed_unit = named or "rad/s"
-        said.append(f"speeds in {speed_unit}" + (", as the header says" if named else ": guessed"))
-    elif named not in ("", speed_unit):
-        doubts.append(f"speeds in {speed_unit}, as --speed-unit says, although the header says {named}")
+    header = [cell for _, cells in _header(table) for cell in cells if not _is_number(table, cell)]
+    speed_unit, doubts = _speed_unit(path, header, speed_unit, said)
+    _check_quantity(path, header, quantity)
     try:
-        cells = _list(table) if layout == "list" else _matrix(table, down)
+        cells = _list(table, said) if layout == "list" else _matrix(table, down)
     except ConfigError as error:
         if not guessed or layout == "list":
             raise
-        problem = f"{error.problem} (taken for a matrix, as it has {len(table.rows[-1][1])} columns)"
+        problem = f"{error.problem} (taken for a matrix, as it has {columns} columns)"
         raise ConfigError(path, error.key, problem, "for a list three columns: speed, torque, value") from None
     if percent is None and quantity == "efficiency":
-        percent = any(value > 1.5 for _, _, _, value in cells)
-        said += ["efficiencies in percent: one is above 1.5"] if percent else []
+        values = [value for _, _, _, value in cells if value > 0.0]
+        percent = 2 * sum(value > 1.5 for value in values) > len(values)
+        said += ["efficiencies in percent: most are above 1.5"] if percent else []
+        if not percent and any("%" in cell for cell in header):
+            doubts.append("efficiencies as fractions of 1, although the header says %: few are above 1.5")
     points: dict[tuple[float, float], float] = {}
     scale = RAD_S_PER_RPM if speed_unit == "rpm" else 1.0
     for line, speed, torque, value in cells:
@@ -86,33 +95,89 @@ def read_points(
         if key in points:
             raise ConfigError(path, f"line {line}", f"repeats speed {speed:g}, torque {torque:g}")
         points[key] = _efficiency(path, line, key, value / 100.0 if percent else value, quantity)
+    grid = len({speed for speed, _ in points}) * len({torque for _, torque in points})
+    if len(points) < _SPARSE * grid:
+        doubts.append(f"its points hardly lie on a grid: {len(points)} of {grid}")
     return Points(points, said, doubts)
 
 
+def _trimmed(table: Table) -> Table:
+    """The table without columns at its end that are empty in every row."""
+    width = max((i for _, cells in table.rows for i, cell in enumerate(cells, 1) if cell), default=0)
+    return table._replace(rows=[(line, cells[:width]) for line, cells in table.rows])
+
+
+def _is_number(table: Table, text: str) -> bool:
+    try:
+        table.number(0, text, "")
+    except ConfigError:
+        return False
+    return True
+
+
+def _header(table: Table) -> list[tuple[int, list[str]]]:
+    """The rows before the first that holds two numbers, and that one: in a matrix its corner may name a unit."""
+    first = next((i for i, (_, row) in enumerate(table.rows) if sum(_is_number(table, x) for x in row) > 1), None)
+    if first is None:
+        raise ConfigError(table.path, "", "holds no numbers", "a text table: speed, torque, value")
+    return table.rows[: first + 1]
+
+
+def _speed_unit(path: Path | str, header: list[str], chosen: str, said: list[str]) -> tuple[str, list[str]]:
+    """The unit of the speeds, and what is doubtful about it."""
+    named = next((unit for unit, names in _SPEED_NAMES.items() if re.search(names, " ".join(header), re.I)), "")
+    for what, (names, allowed) in _OTHER_UNITS.items():
+        strange = next((cell for cell in header if re.search(names, cell, re.IGNORECASE)), None)
+        if strange is not None and not (what == "speeds" and (named or chosen != "auto")):
+            raise ConfigError(path, "", f"the header says {strange!r}: {what} in another unit", allowed)
+    if chosen == "auto":
+        said.append(f"speeds in {named or 'rad/s'}" + (", as the header says" if named else ": guessed"))
+        return named or "rad/s", []
+    doubt = f"speeds in {chosen}, as --speed-unit says, although the header says {named}"
+    return chosen, [] if named in ("", chosen) else [doubt]
+
+
+def _check_quantity(path: Path | str, header: list[str], quantity: str) -> None:
+    """Refuse losses that would be taken for efficiencies."""
+    lost = next((cell for cell in header if re.search("loss|verlust", cell, re.IGNORECASE)), None)
+    if lost is not None and quantity == "efficiency":
+        raise ConfigError(path, "", f"the header says {lost!r}", "efficiencies, or --quantity loss")
+
+
 def _value(table: Table, line: int, text: str, column: str) -> float:
-    return math.nan if text.lower() in _NOTHING else table.number(line, text, column)
+    nothing = text.lower() in _NOTHING or text.startswith("#")  # a spreadsheet's errors
+    return math.nan if nothing else table.number(line, text, column)
 
 
-def _list(table: Table) -> list[tuple[int, float, float, float]]:
+def _list(table: Table, said: list[str]) -> list[tuple[int, float, float, float]]:
+    *header, _ = _header(table)
+    swapped = any(len(row) == 3 and re.search(_TORQUE, row[0]) and re.search(_SPEED, row[1]) for _, row in header)
+    said += ["torques in the first column, as the header says"] if swapped else []
     rows = []
-    for line, cells in table.rows[1:]:
+    for line, cells in table.rows[len(header) :]:
         if len(cells) != 3:
             raise ConfigError(table.path, f"line {line}", f"has {len(cells)} values", "3: speed, torque, value")
+        if swapped:
+            cells = [cells[1], cells[0], cells[2]]
         speed, torque = (table.number(line, cells[i], COLUMNS[i]) for i in (0, 1))
         rows.append((line, speed, torque, _value(table, line, cells[2], "value")))
     return rows
 
 
 def _matrix(table: Table, down: str) -> list[tuple[int, float, float, float]]:
-    first, head = table.rows[0]
+    *title, (first, head) = _header(table)
+    if title and len(title[-1][1]) > 1 and all(title[-1][1]):
+        raise ConfigError(table.path, f"line {title[-1][0]}, column 2", f"{title[-1][1][1]!r} is no number")
     across = [table.number(first, text, f"column {i}") for i, text in enumerate(head[1:], 2) if text]
     rows = []
-    for line, cells in table.rows[1:]:
+    for line, cells in table.rows[len(title) + 1 :]:
         if len(cells) > len(across) + 1 and any(cells[len(across) + 1 :]):
             raise ConfigError(
                 table.path, f"line {line}", f"has {len(cells) - 1} values", f"{len(across)}, as in line {first}"
             )
         side = table.number(line, cells[0], "column 1")
+        if down == "speed" and side < 0.0:
+            raise ConfigError(table.path, f"line {line}", f"speed {side:g} is out of range", ">= 0, or --down torque")
         for i, top in enumerate(across, 1):
             value = _value(table, line, cells[i] if i < len(cells) else "", f"column {i + 1}")
             rows.append((line, side, top, value) if down == "speed" else (line, top, side, value))
@@ -133,7 +198,9 @@ def _efficiency(path: Path | str, line: int, key: tuple[float, float], value: fl
             raise ConfigError(path, f"line {line}", f"loss {value:g} W is out of range", ">= 0")
         return power / (power + value) if power > 0.0 else max(1.0 + value / power, 0.0)
     if not 0.0 <= value <= 1.0:
-        raise ConfigError(path, f"line {line}", f"efficiency {value:g} is out of range", "0 to 1, or --percent")
+        braking = " (braking: electrical over mechanical power)" if power < 0.0 else ""
+        problem = f"efficiency {value:g} is out of range"
+        raise ConfigError(path, f"line {line}", problem, f"0 to 1{braking}, or --percent, or --quantity loss")
     return value
 
 

@@ -16,6 +16,7 @@ SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " ", "bar": 
 MAX_ROWS = 2_000_000
 MAX_COLUMNS = 1000
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+([eE][-+]?[0-9]+)?")
+_THOUSANDS = re.compile(r"[-+]?[0-9]{1,3}(\.[0-9]{3})+(,[0-9]+)?")
 
 
 class Table(NamedTuple):
@@ -28,6 +29,9 @@ class Table(NamedTuple):
 
     def number(self, line: int, text: str, column: str) -> float:
         """A cell as a number; `ConfigError` names line and column."""
+        if self.decimal == "," and _THOUSANDS.fullmatch(text):
+            problem = f"{text!r} has a point, in a table of decimal commas: a mark of thousands?"
+            raise ConfigError(self.path, f"line {line}, {column}", problem, "numbers without it, or --decimal point")
         plain = text.replace(",", ".") if self.decimal == "," and _DECIMAL_COMMA.fullmatch(text.strip()) else text
         try:
             return to_number(plain)

@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
         "--percent",
         action=argparse.BooleanOptionalAction,
         default=None,
-        help="efficiencies are in percent (default: if one is above 1.5)",
+        help="efficiencies are in percent (default: if most are above 1.5)",
     )
     table.add_argument(
         "--quantity", choices=("efficiency", "loss"), default="efficiency", help="loss: in W (default: %(default)s)"

@@ -52,7 +52,7 @@ def test_a_list_in_rpm_and_percent(tmp_path, capsys):
     code, out, err = run(capsys, table, "--output", tmp_path / "map.csv", *options)
     assert (code, err) == (0, "")
     assert "speeds in rpm, as the header says" in out
-    assert "efficiencies in percent: one is above 1.5" in out
+    assert "efficiencies in percent: most are above 1.5" in out
     assert "loss model: 46 + 0.69 w + 0.0151 w^2 + 2.03 |T| + 0.0685 T^2 W" in out
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((tmp_path / "map.json").read_text())["best_efficiency"]["speed_radps"] == pytest.approx(150.0)
@@ -110,6 +110,21 @@ def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys)
             "is no number (taken for a matrix, as it has 4 columns); allowed: for a list three columns: speed, torque",
         ),
         ("w,t,eta\n1,2,nan\n2,3,nan\n", (), "has no efficiency above 0 where speed and torque are not 0"),
+        (
+            "w,t,eta\n1,2,0.8\n2,-2,4.1\n2,2,0.9\n",
+            (),
+            "efficiency 4.1 is out of range; allowed: 0 to 1 (braking:",
+        ),
+        ("w,t,loss W\n1,2,46\n", (), "the header says 'loss W'; allowed: efficiencies, or --quantity loss"),
+        ("w,t,loss kW\n1,2,4\n", ("--quantity", "loss"), "'loss kW': losses in another unit; allowed: W"),
+        ("rpm,kNm,eta\n1,2,0.4\n", (), "'kNm': torques in another unit; allowed: N m"),
+        ("km/h,Nm,eta\n1,2,0.4\n", (), "'km/h': speeds in another unit; allowed: rad/s or rpm: --speed-unit"),
+        ("1/s,Nm,eta\n1,2,0.4\n", (), "'1/s': speeds in another unit"),
+        ("krpm,Nm,eta\n1,2,0.4\n", (), "'krpm': speeds in another unit"),
+        ("rpm;Nm;eta\n955;2,5;0,4\n1.194;2,5;0,4\n", (), "'1.194' has a point, in a table of decimal commas"),
+        ("T,1,2,3\n-5,0.1,0.2,0.3\n", (), "speed -5 is out of range (taken for a matrix"),
+        ("T,1,2,3\n-5,0.1,0.2,0.3\n", ("--layout", "matrix"), "allowed: >= 0, or --down torque"),
+        ("PK\x03\x04 no table at all\n", (), "holds no numbers; allowed: a text table"),
     ],
 )
 def test_what_cannot_be_used_is_one_line_and_nothing_is_written(tmp_path, capsys, text, options, words):
@@ -120,6 +135,45 @@ def test_what_cannot_be_used_is_one_line_and_nothing_is_written(tmp_path, capsys
     assert err.count("\n") == 1
     assert words in err
     assert not (tmp_path / "map.csv").exists()
+
+
+def listed(row="{w},{t},{e}", head="speed_rad_s,torque_nm,efficiency\n", nothing=""):
+    """The shipped map as a list; NaN as `nothing`."""
+    lines = []
+    for w, t, e in points():
+        known = nothing if math.isnan(e) else f"{e:.9f}"
+        lines.append(row.format(w=w, t=t, e=known, rpm=f"{w * RPM:.9f}"))
+    return head + "".join(f"{line}\n" for line in lines)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        listed(),
+        listed(head=""),
+        listed(head="speed,torque,efficiency\nrad/s,Nm,1\n"),
+        listed("{rpm},{t},{e}", "Motor of 2015,,\nspeed,torque,efficiency\nrpm,Nm,-\n"),
+        listed("{rpm}\t{t}\t{e}\t", "\ufeffrpm\tNm\teta\t\n"),
+        listed(head="w,t,eta\n").replace("\n", "\r\n") + "\r\n,,\r\n",
+        listed("{t},{w},{e}", "torque_nm,speed_rad_s,efficiency\n"),
+        *(listed(nothing=nothing) for nothing in ("NaN", "#N/A", "-", "n.a.", "#DIV/0!")),
+    ],
+    ids=["plain", "no head", "units", "title and units", "tabs", "crlf", "torque first", *"abcde"],
+)
+def test_a_sheet_as_programs_write_them_is_read_as_it_is_meant(tmp_path, capsys, text):
+    (tmp_path / "sheet.csv").write_text(text, newline="")
+    code, _, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "map.csv")
+    assert (code, err) == (0, "")
+    same(tmp_path / "map.csv")
+
+
+def test_points_on_no_grid_and_a_header_in_percent_are_warned_of(tmp_path, capsys):
+    rows = "".join(f"{w + 0.01 * i},{t},{e}\n" for i, (w, t, e) in enumerate(points()))
+    (tmp_path / "sheet.csv").write_text("rad/s,Nm,eta [%]\n" + rows)
+    code, _, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "map.csv")
+    assert code == 0
+    assert "its points hardly lie on a grid" in err
+    assert "efficiencies as fractions of 1, although the header says %" in err
 
 
 def test_a_unit_that_contradicts_the_header_is_warned_of(tmp_path, capsys):
