@@ -72,7 +72,7 @@ class PolicyBank:
         self._why_none = why_none or "the strategy needs a policy; name one with --policy"
         self._rule = tuple(rule)
         self._vehicle = vehicle
-        self._bank: list[Policy] | None = None
+        self._bank: list[Policy] = []
         self._tables: dict[str, PolicyTable] = {}
         self._empty = empty_table(rule=self._rule)
 
@@ -86,7 +86,10 @@ class PolicyBank:
         """
         if not STRATEGIES[name_of(strategy)].needs_policy:
             return self._empty
-        policy = choose(self._loaded(), friction)
+        if not self._path:
+            raise PolicyError(self._why_none)
+        self._bank = self._bank or load_policy_bank(resolve(self._path), self._vehicle)
+        policy = choose(self._bank, friction)
         if policy.checksum not in self._tables:
             self._tables[policy.checksum] = policy.table(self._rule)
         return self._tables[policy.checksum]
@@ -94,7 +97,7 @@ class PolicyBank:
     @property
     def checksums(self) -> list[str]:
         """Identities of the policies loaded so far."""
-        return [policy.checksum for policy in self._bank or []]
+        return [policy.checksum for policy in self._bank]
 
     @property
     def used(self) -> list[str]:
@@ -105,13 +108,6 @@ class PolicyBank:
     def content_sha256(self) -> str:
         """Hash of the file or folder, as a recorder takes it; "" if no step needed a policy."""
         return content_sha256(resolve(self._path)) if self._bank else ""
-
-    def _loaded(self) -> list[Policy]:
-        if self._bank is None:
-            if not self._path:
-                raise PolicyError(self._why_none)
-            self._bank = load_policy_bank(resolve(self._path), self._vehicle)
-        return self._bank
 
 
 class Plan(NamedTuple):
@@ -246,10 +242,9 @@ def _number(recorded: Mapping[str, Any], name: str, default: float) -> float:
 
 
 def _numbers(values: object) -> tuple[float, ...]:
-    if not isinstance(values, list):
-        return ()
-    usable = all(isinstance(value, int | float) and abs(value) < _LARGEST for value in values)
-    return tuple(map(float, values)) if usable else ()
+    numbers = values if isinstance(values, list) else []
+    usable = all(isinstance(value, int | float) and abs(value) < _LARGEST for value in numbers)
+    return tuple(map(float, numbers)) if usable else ()
 
 
 def _wheel_names(names: object) -> tuple[str, ...]:
