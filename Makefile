@@ -30,7 +30,7 @@ policies: setup-run  ## Solve the shipped policies again, the same tables come o
 study: setup-run  ## All tables and figures of the paper, and what beats them (3 min)
 	@$(BIN)/evaluate --study runs/study $(ARGS)
 
-unseen: setup-run  ## Our strategy on cycles and cars that were not there when it was made (shows how far)
+unseen: setup-run  ## Our strategy on cycles and cars that were not there when it was made (half an hour)
 	@$(BIN)/evaluate --unseen runs/unseen $(ARGS)
 
 roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required (2 min)
@@ -56,7 +56,7 @@ docs: setup-dev  ## The pages, every --help and the API as a site: build/docs/ht
 faults: setup-run  ## Fault campaign over DDS with the simulator in the loop (7 min)
 	@$(BIN)/python -m campaigns.faults $(ARGS)
 
-soak: setup-dev  ## 30 minutes in real time at 100 Hz: memory, deadlines, counts
+soak: setup-dev  ## In real time at 100 Hz: memory, deadlines, counts (30 min)
 	@$(BIN)/python -m campaigns.soak $(ARGS)
 
 nightly: setup-dev  ## The tests that are too long for every run, and far more random cases in the others (hours)
@@ -84,17 +84,17 @@ lint: setup-dev  ## ruff: style, docstrings, likely mistakes; import-linter: the
 type: setup-dev  ## mypy, strict (1 min)
 	@$(BIN)/mypy
 
-format: setup-dev  ## Reformat the sources
+format: setup-dev  ## Reformat the sources (seconds)
 	@$(BIN)/ruff check --fix . && $(BIN)/ruff format .
 
-sbom: setup-dev  ## What a user's installation is made of, as a CycloneDX list: sbom.cdx.json
+sbom: setup-dev  ## What a user's installation is made of, as a CycloneDX list: sbom.cdx.json (seconds)
 	@cat requirements/{build,base,ros}.txt | $(BIN)/cyclonedx-py requirements - --output-reproducible --of JSON -o sbom.cdx.json
 	@echo "sbom.cdx.json: $$(grep -c '"purl"' sbom.cdx.json) components"
 
-build: setup-dev  ## colcon build into build/ and install/
+build: setup-dev  ## colcon build into build/ and install/ (1 min)
 	@scripts/colcon_build
 
-clean:  ## Remove what was built, logged or cached here (.venv stays)
+clean:  ## Remove what was built, logged or cached here; .venv stays (seconds)
 	@rm -rf build install log dist .pytest_cache .hypothesis .mypy_cache .ruff_cache .coverage .coverage.* htmlcov *.egg-info sbom.cdx.json
 	@find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
 

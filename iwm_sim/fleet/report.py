@@ -259,7 +259,7 @@ def page_of(store: Store) -> tuple[Page, list[Savings]]:
     blocks.append(Text("Rows, one for each drive, stand in rows/*.parquet beside this page.", "Rows"))
     blocks.append(Settings("Made with", begun["fingerprint"]))
     lead = "Every number is simulated; a saving is given only where both runs held the trace over the same distance."
-    return Page("A fleet", lead, blocks, contents=True), savings
+    return Page("A fleet", lead, blocks, contents_after=0), savings
 
 
 def make(folder: Path, page: Path, picture: Path | None = None, numbers: Path | None = None) -> None:

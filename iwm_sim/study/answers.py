@@ -160,7 +160,7 @@ WORDS = {
     "paper_sdp": "the paper's stochastic program on the paper's grid, decided every 0.1 s",
     "ours": "strategy sdp_lookahead: one step ahead on the cost-to-go of grid coupled, decided every 0.02 s",
     "preview": "dynamic programming with the whole cycle known in advance; its budget or price of changes is beside it",
-    "possible": "what preview saves with our budget of changes of the split; with more changes more can be saved",
+    "possible": labels.POSSIBLE,
     "instantaneous": "least battery power now; instantaneous_slip counts slip and load transfer, and a change has to "
     "save the power named beside it",
     "share": "front power over power demand, 0..1; a change of it by more than 0.25 counts",

@@ -9,3 +9,8 @@ INSTANTANEOUS_SLIP = "instantaneous_slip"
 #: Names in `variants.VARIANTS`.
 PAPER_SDP, GATE_OFF, GATE_TABLE_2 = "paper_sdp", "paper_sdp_ungated", "paper_sdp_table2"
 FREE_BOUND = "preview, changes free"
+#: What these pages call possible.
+POSSIBLE = (
+    "what preview, which knows the whole cycle, saves with our budget of changes of the split, or another strategy "
+    "with no more changes where that is more; more changes can save more"
+)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -32,7 +33,7 @@ def write(output: Path, study: Study, pictures: Sequence[Drawn]) -> None:
 
 
 def update_document(path: Path, study: Study) -> None:
-    """Replace what stands between the markers of a Markdown file by a study's answers and tables.
+    """Replace what stands between the markers of a Markdown file by a study's tables.
 
     Raises
     ------
@@ -44,7 +45,7 @@ def update_document(path: Path, study: Study) -> None:
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise ConfigError(path, "", "has no place for generated tables", f"the lines {BEGIN} and {END}")
-    atomic_write(path, f"{before}{begin}\n\n{markdown(study)}\n\n{end}{after}".encode())
+    atomic_write(path, f"{before}{begin}\n\n{tables_markdown(study)}\n\n{end}{after}".encode())
 
 
 def sections(study: Study) -> Iterator[tuple[str, list[TableOf]]]:
@@ -54,33 +55,37 @@ def sections(study: Study) -> Iterator[tuple[str, list[TableOf]]]:
 
 
 def markdown(study: Study) -> str:
-    """Answers and all tables in Markdown, with the command that makes each."""
-    parts = [f"**{made.question}** {made.answer}" for made in answers(study)]
+    """Answers, contents and all tables in Markdown."""
+    lines = [f"**{made.question}** {made.answer}" for made in answers(study)]
+    plain = {name: re.sub(r"[^\w\- ]", "", name.lower()).replace(" ", "-") for name, _ in sections(study)}
+    contents = "\n".join(f"- [{name}](#{anchor})" for name, anchor in plain.items())
+    return "\n\n".join([*lines, contents, tables_markdown(study)])
+
+
+def tables_markdown(study: Study) -> str:
+    """All tables in Markdown, each with the command that makes it."""
+    parts = []
     for name, found in sections(study):
         parts.append(f"## {name}")
         if found[0].note:
             parts.append(found[0].note)
         for table in found:
             parts += [f"**{table.title}**"] if table.title else []
-            parts.append(markdown_table(table.rows, table.columns))
-        commands = list(dict.fromkeys(table.command for table in found if table.command))
-        parts.append(f"Made by {' and '.join(f'`{command}`' for command in commands or ['make study'])}.")
+            parts += [markdown_table(table.rows, table.columns), f"Made by `{table.command}`."]
     return "\n\n".join(parts)
 
 
 def page(study: Study, pictures: Sequence[Drawn]) -> Page:
     """The study as a page."""
-    first, *others = answers(study)
-    blocks: list[Block] = [Text(made.answer, made.question) for made in (first, *others)]
+    blocks: list[Block] = [Text(made.answer, made.question) for made in answers(study)]
+    answered = len(blocks)
     for name, found in sections(study):
         blocks.append(Text(found[0].note, name))
-        blocks += [Table("", table.columns, table.rows, caption=table.title) for table in found]
-        near = [made for made in pictures if made.section == name]
-        if near:
-            blocks.append(Pictures("", [Picture(made.title, made.figure, made.note) for made in near]))
-    rest = [made for made in pictures if made.section not in {name for name, _ in sections(study)}]
-    if rest:
-        blocks.append(Pictures("Other figures", [Picture(made.title, made.figure, made.note) for made in rest]))
+        blocks += [
+            Table("", table.columns, table.rows, f"Made by {table.command}", caption=table.title) for table in found
+        ]
+        blocks += _pictures("", [made for made in pictures if made.section == name])
+    blocks += _pictures("Other figures", [made for made in pictures if made.section not in dict(sections(study))])
     blocks.append(Settings("Words", WORDS))
     blocks.append(
         Settings(
@@ -95,4 +100,9 @@ def page(study: Study, pictures: Sequence[Drawn]) -> Page:
         )
     )
     lead = "One car, four cycles, three roads, two readings of what an idle axle costs; every number is simulated."
-    return Page(TITLE, lead, blocks, contents=True)
+    return Page(TITLE, lead, blocks, contents_after=answered)
+
+
+def _pictures(title: str, made: Sequence[Drawn]) -> list[Block]:
+    found = [Picture(one.title, one.figure, f"{one.note} Made by {one.command}") for one in made]
+    return [Pictures(title, found)] if found else []

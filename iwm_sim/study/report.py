@@ -250,7 +250,7 @@ class Page:
     ----------
     title, lead : what the page is, and the one sentence to take away
     blocks : its parts, in order
-    contents : whether a list of its headings comes first
+    contents_after : so many blocks are followed by a list of all headings; None: there is none
     valid : None, or whether the run it shows may be used, with `verdict` saying why
     """
 
@@ -259,7 +259,7 @@ class Page:
     blocks: Sequence[Block]
     valid: bool | None = None
     verdict: str = ""
-    contents: bool = False
+    contents_after: int | None = None
 
 
 @functools.cache

@@ -42,8 +42,8 @@ class Row:
     strategy : name in `STRATEGIES`
     metrics : what was measured
     saving_percent : energy saved against equal split of the same drive; None as `saving_percent` says
-    share_of_possible : the saving as a part of the most that `preview` or another strategy saves with no more changes
-        than `preview` may make, where that was driven and there is anything to save
+    share_of_possible : the saving as a part of the most that `preview` with a budget of changes, or another strategy
+        with no more changes, saves, where that was driven and there is anything to save
     same_distance_as_equal : None without equal split to compare with
     made_with : settings, hashes and whatever else the numbers depend on, as plain values
     """
@@ -56,6 +56,11 @@ class Row:
     share_of_possible: float | None
     same_distance_as_equal: bool | None
     made_with: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def possible_percent(self) -> float | None:
+        """What its saving is a part of, %; None where it is a part of nothing."""
+        return self.saving_percent / self.share_of_possible if self.saving_percent and self.share_of_possible else None
 
     def to_json(self) -> dict[str, Any]:
         """The row as flat plain values; what was not measured is null."""
@@ -136,7 +141,7 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
         group = _group(made.case)
         if made.case.strategy == REFERENCE:
             references.setdefault(group, made.metrics)
-        if made.case.strategy == "preview":
+        if made.case.strategy == "preview" and made.case.changes_per_min > 0.0:
             bounds.setdefault(group, made)
     possible = {
         group: _possible(bound, [made for made in results if _group(made.case) == group], references.get(group))

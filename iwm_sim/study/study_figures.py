@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -65,6 +66,13 @@ class Drawn(NamedTuple):
     note: str
     figure: Figure
     section: str = ""
+
+    @property
+    def command(self) -> str:
+        """What draws it alone."""
+        number = re.match(r"figure_0?(\d+)", self.file)
+        name = number[1] if number else {"transition_matrix": "transitions"}.get(self.file, self.file)
+        return f"evaluate --figure {name} --plot {self.file}.pdf"
 
     def captioned(self) -> Figure:
         """The figure with title and note above it, for where no page says them."""

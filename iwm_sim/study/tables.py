@@ -64,8 +64,28 @@ def text_table(rows: Sequence[Row], columns: Sequence[Column[Row]] = COLUMNS) ->
     return "\n".join(lines[1:])
 
 
-def plain_table[R](rows: Sequence[R], columns: Sequence[Column[R]]) -> str:
-    """A plain-text table under up to three lines of heading: group (once over its columns), label, unit."""
+def plain_table[R](rows: Sequence[R], columns: Sequence[Column[R]], width: int = 0) -> str:
+    """A plain-text table under up to three lines of heading: group (once over its columns), label, unit.
+
+    One that is wider than `width` (0: any is not) goes on below, group by group, each part with the columns before the
+    first group.
+    """
+    text = _plain_table(rows, columns)
+    if not width or max(map(len, text.splitlines())) <= width:
+        return text
+    parts = [list(found) for _, found in itertools.groupby(columns, lambda column: column.group)]
+    keys, *groups = parts if not parts[0][0].group else [[], *parts]
+    made, shown = [], list[Column[R]]()
+    for group in groups:
+        wider = _plain_table(rows, [*keys, *shown, *group])
+        if shown and max(map(len, wider.splitlines())) > width:
+            made.append(_plain_table(rows, [*keys, *shown]))
+            shown = []
+        shown += group
+    return "\n\n".join([*made, _plain_table(rows, [*keys, *shown])])
+
+
+def _plain_table[R](rows: Sequence[R], columns: Sequence[Column[R]]) -> str:
     heads = [[column.label for column in columns], [column.unit for column in columns]]
     lines = [line for line in heads if any(line)] + [[column.shown(row) for column in columns] for row in rows]
     widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]

@@ -42,6 +42,10 @@ def run(mode: str, options: argparse.Namespace) -> None:
     _RUN[mode](options)
 
 
+#: Columns of a wide terminal.
+SCREEN = 120
+
+
 # --- cases ----------------------------------------------------------------------------------------------------------
 
 
@@ -229,7 +233,7 @@ def _paper(options: argparse.Namespace) -> None:
     if not options.quiet:
         for table in tables:
             title = table.title if table.section == TABLES else f"{table.section}: {table.title}"
-            print(f"{title}\n{plain_table(table.rows, table.columns)}\n")
+            print(f"{title}\n{plain_table(table.rows, table.columns, SCREEN)}\n")
         print(f"{table.note}\n{_policies_text(policies)}")
     if options.json:
         rows = [row.to_json() for table in tables for cell in table.rows for row in cell.values()]

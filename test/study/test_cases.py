@@ -50,15 +50,20 @@ def test_a_policy_for_another_car_is_refused(equal, small_policy):
 
 
 def test_preview_saves_what_it_schedules(equal):
-    rows = rows_of([cases.result(equal), cases.result(dataclasses.replace(equal, strategy="preview"))])
+    free = dataclasses.replace(equal, strategy="preview")
+    rows = rows_of([cases.result(equal), cases.result(free)])
     assert rows[0].saving_percent == 0.0
     assert rows[1].saving_percent > 0.5
-    assert rows[1].share_of_possible == 1.0
+    assert rows[1].share_of_possible is None  # without a budget of changes there is nothing called possible
+    within = rows_of([cases.result(equal), cases.result(dataclasses.replace(free, changes_per_min=8.0))])[1]
+    assert within.share_of_possible == 1.0
+    assert within.possible_percent == within.saving_percent
 
 
 def test_share_of_possible_is_the_part_of_the_previews_saving(equal):
     results = [
-        cases.result(dataclasses.replace(equal, strategy=name)) for name in ("equal", "preview", "instantaneous_slip")
+        cases.result(dataclasses.replace(equal, strategy=name, changes_per_min=8.0))
+        for name in ("equal", "preview", "instantaneous_slip")
     ]
     _, bound, rival = rows_of(results)
     assert rival.share_of_possible == pytest.approx(rival.saving_percent / bound.saving_percent)

@@ -15,6 +15,7 @@ from iwm_sim.metrics import Metrics
 from iwm_sim.study import answers, battery_fit, criteria, labels, pages, paper, study_tables
 from iwm_sim.study.cases import Rule, vehicle_of
 from iwm_sim.study.content import Study
+from iwm_sim.study.names import FIGURES
 from iwm_sim.study.report import anchor, render
 from iwm_sim.study.rows import Place, Row, by_place
 from iwm_sim.study.study_figures import Material, drawn
@@ -116,9 +117,16 @@ def test_page_markdown_and_pictures_are_written(content, material, tmp_path):
         assert any(name.startswith(f"figure_{number}_") for name in files)
     page = (tmp_path / "study.html").read_text()
     assert all(picture.title in page for picture in pictures)
-    assert page.index(answers.answers(content)[0].question) < page.index("<table")
+    assert page.index(answers.answers(content)[-1].answer[:20]) < page.index("<nav") < page.index("<table")
     assert "http://" not in page.replace("http://www.w3.org", "")
-    assert (tmp_path / "study.md").read_text().startswith(f"# {pages.TITLE}")
+    text = (tmp_path / "study.md").read_text()
+    assert text.startswith(f"# {pages.TITLE}")
+    assert text.count("\nMade by `") == len(study_tables.tables(content)) == page.count("Made by ") - len(pictures)
+
+
+def test_every_figure_names_the_command_that_draws_it(content, material):
+    pictures = drawn(content.frontier, material, vehicle_of("jalalmaab_2015", "none").params)
+    assert sorted(picture.command.split()[2] for picture in pictures) == sorted(FIGURES)
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

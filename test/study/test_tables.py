@@ -35,6 +35,22 @@ def test_a_lost_trace_and_another_distance_are_marked():
     assert "−1.46" not in text
 
 
+def test_a_table_wider_than_the_screen_goes_on_below_with_its_first_columns():
+    columns = [
+        Column("Cycle", lambda row: row[0]),
+        *(
+            Column(label, lambda row: row[1], "%", 1, group=group)
+            for group in ("slip", "jerk", "locked")
+            for label in ("without", "with")
+        ),
+    ]
+    text = plain_table([("nycc", 1.0)], columns, 40)
+    assert max(map(len, text.splitlines())) <= 40
+    assert [part.split()[:1] + part.split()[-1:] for part in text.split("\n\n")] == [["slip", "1.0"], ["locked", "1.0"]]
+    assert text.count("nycc") == 2
+    assert plain_table([("nycc", 1.0)], columns, 200) == plain_table([("nycc", 1.0)], columns)
+
+
 def test_markdown_escapes_what_would_break_a_table():
     columns = [Column("Name", lambda row: row[0]), Column("here", lambda row: row[1], "W", 1, group="Value")]
     text = markdown_table([("a|b", 1.0)], columns)
