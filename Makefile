@@ -39,8 +39,10 @@ roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside w
 docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (2 min)
 	@$(BIN)/python scripts/docs_numbers $(ARGS)
 
-bench: setup-dev  ## Time control path, bags, solver and closed loop on this machine, each beside a peer (an hour)
-	@for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script $(ARGS) || exit $$?; done
+bench: bench-peers  ## All that has to be fast, each beside its peer, in one table, then control path and signals (an hour)
+	@mkdir -p runs && $(BIN)/python benchmarks/performance.py --fastsim runs/peers/bin/python --json runs/performance.json $(ARGS)
+	@for name in control_path convergence learning plant signals; do \
+	  echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit $$?; done
 
 bench-peers: setup-dev  ## FASTSim in an environment of its own, runs/peers: a peer of benchmarks/performance.py (1 min)
 	@test -x runs/peers/bin/python || $(BIN)/python -m venv runs/peers

@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""How fast the solver and the closed loop are: beside their peers, beside an earlier checkout, and how exact.
+"""How fast all of it is: beside its peers, beside an earlier checkout, and how exact.
 
 Every row is a process of its own, after one that compiles: a warm-up, then the timed runs; its peak memory is its own.
 Times are of the processor, summed over the threads, so that another busy process tells in the spread but not in the
 median, and on the clock. `--before FOLDER` runs an earlier checkout of this package in turns; `--fastsim PYTHON` an
 interpreter that has the packages of benchmarks/requirements.txt; `--page FILE` puts the table between that page's
-markers.
+markers. Bags, starts and the fleet of 1,000 drives have programs of their own beside this one, which are run for their
+rows; with `--page` that of the fleet fills scale.md and scale.json beside the page.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
 import math
@@ -23,6 +25,7 @@ import resource
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -36,13 +39,17 @@ BEGIN, END = "<!-- measured: benchmarks/performance.py -->", "<!-- end -->"
 
 
 class Row(NamedTuple):
-    """What a row is, its goals (seconds on the clock, times the peer's processor time, MB), and its peer."""
+    """What a row is, its goals (seconds on the clock, times the peer's processor time, MB), and its peer.
+
+    `size`: points of the speed axis and of each slip axis of a grid that is solved once, without an earlier checkout.
+    """
 
     what: str
     clock_s: float = math.inf
     of_peer: float = math.inf
     memory_mb: float = math.inf
     peer: str = ""
+    size: tuple[int, int] | None = None
 
     def goal(self) -> str:
         """The goals in words."""
@@ -59,7 +66,7 @@ class Row(NamedTuple):
 
     def met(self, now: dict[str, Any], peer: dict[str, Any] | None) -> bool:
         """Whether all of them are."""
-        theirs = statistics.median(peer["cpu_s"]) if peer else math.inf
+        theirs = statistics.median(peer["cpu_s"]) if peer and peer["cpu_s"] else math.inf
         return (
             statistics.median(now.get("clock_s", [0.0])) <= self.clock_s
             and statistics.median(now["cpu_s"]) <= self.of_peer * theirs
@@ -67,13 +74,19 @@ class Row(NamedTuple):
         )
 
 
+#: What a solver of sparse matrices may take before it has got as far as it gets, bytes.
+PEER_LIMIT = 8 * 2**30
 ROWS = {
-    "transitions": Row("transitions of the paper's problem, 41 controls", clock_s=0.25),
+    "transitions": Row("transitions of the paper's problem, 41 controls", clock_s=0.25, peer="naive"),
     "solve": Row(
         "the paper's problem, 41 controls, discount 0.95: solve", of_peer=0.05, memory_mb=150.0, peer="quantecon"
     ),
     "coupled": Row("grid `coupled`, one price: tabulate + solve", clock_s=0.2),
     "fine": Row("grid `fine`, 1.4 million states: tabulate + solve", clock_s=5.0),
+    "states_1e4": Row("`fine` with other axes, 10^4 states", peer="quantecon", size=(4, 3)),
+    "states_1e5": Row("10^5 states", peer="quantecon", size=(11, 5)),
+    "states_1e6": Row("10^6 states", peer="quantecon", size=(11, 17)),
+    "states_1e7": Row("10^7 states", size=(40, 27)),
     "drive": Row("UDDS, `equal`, 100 Hz, four wheels and slip", clock_s=0.15),
     "drive_10hz": Row("UDDS, `equal`, 10 Hz, four wheels and slip", of_peer=1.0, peer="fastsim"),
     "lookahead": Row("UDDS, `sdp_lookahead`, 100 Hz", clock_s=0.5),
@@ -174,12 +187,78 @@ def grid(name: str, repeat: int, **changes: Any) -> dict[str, Any]:
     problem, car, demand = _problem(name, **changes)
 
     def run() -> Any:
+        began = time.perf_counter()
         model = build_model(problem, car, FRICTION, demand)
-        return model, _solved(problem, model)
+        tabulated = time.perf_counter()
+        solution = _solved(problem, model)
+        return model, solution, {"tabulate": tabulated - began, "solve": time.perf_counter() - tabulated}
 
-    (model, solution), times = _timed(repeat, run)
+    (model, solution, parts), times = _timed(repeat, run)
     sweeps = solution.iterations[-1].evaluation_sweeps
-    return times | {"exact": f"{sweeps} sweeps, {_exact(model, solution)}"}
+    return times | {"parts": parts, "exact": f"{sweeps} sweeps, {_exact(model, solution)}"}
+
+
+def _sized(speeds: int, slips: int) -> tuple[Any, Any, Any]:
+    """Grid `fine` with so many points, dense where it was dense."""
+
+    def refined(axis: Any, points: int) -> Any:
+        return np.interp(np.linspace(0.0, axis.size - 1.0, points), np.arange(axis.size), axis)
+
+    base = _problem("fine")[0]
+    front, rear = refined(base.slip_front, slips), refined(base.slip_rear, slips)
+    return _problem("fine", speed_mps=refined(base.speed_mps, speeds), slip_front=front, slip_rear=rear)
+
+
+def states(speeds: int, slips: int) -> dict[str, Any]:
+    """Tabulate and solve a size, once."""
+    from iwm_power_manager.mdp.transitions import build_model
+
+    def run(size: tuple[int, int]) -> tuple[Any, Any, float]:
+        problem, car, demand = _sized(*size)
+        started = time.perf_counter()
+        model = build_model(problem, car, FRICTION, demand)
+        tabulated_s = time.perf_counter() - started
+        return model, _solved(problem, model), tabulated_s
+
+    run((4, 3))  # loads the kernels
+    before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    began, started = time.perf_counter(), time.process_time()
+    model, solution, tabulated_s = run((speeds, slips))
+    cpu_s, clock_s = time.process_time() - started, time.perf_counter() - began
+    count = int(np.prod(model.state_shape))
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0 - before_mb) * 2**20 / count
+    return {
+        "cpu_s": [cpu_s],
+        "clock_s": [clock_s],
+        "parts": {"tabulate": tabulated_s, "solve": clock_s - tabulated_s},
+        "exact": f"{count:,} states, {grown:.0f} bytes and {1e6 * cpu_s / count:.1f} us each, "
+        f"{solution.iterations[-1].evaluation_sweeps} sweeps, certified {solution.bound_j:.1e} J",
+    }
+
+
+def naive(repeat: int) -> dict[str, Any]:
+    """The peer of `transitions`: the step of every state and control, one after the other, compiled."""
+    import numba
+
+    from iwm_power_manager.model.decision import step_cost_and_next
+
+    problem, car, _ = _paper()
+
+    @numba.njit
+    def tabulate(powers, speeds, fronts, rears, shares, car, params):
+        cost, i = np.empty(powers.size * speeds.size * fronts.size * rears.size * shares.size), 0
+        for p in powers:
+            for v in speeds:
+                for f in fronts:
+                    for r in rears:
+                        for u in shares:
+                            cost[i] = step_cost_and_next(p, v, f, r, u, car, params).cost_j
+                            i += 1
+        return cost
+
+    axes = (problem.power_w, problem.speed_mps, problem.slip_front, problem.slip_rear, problem.share)
+    cost, times = _timed(repeat, lambda: tabulate(*axes, car, problem.params(FRICTION)))
+    return times | {"exact": f"{cost.size:,} pairs in a plain loop"}
 
 
 def drive(strategy: str, dt_s: float, repeat: int) -> dict[str, Any]:
@@ -195,7 +274,59 @@ def drive(strategy: str, dt_s: float, repeat: int) -> dict[str, Any]:
     table = load_policy(resolve("jalalmaab_2015_drag_coupled_mu090")).table()
     cycle, settings = load_cycle(resolve("udds")), default_settings(strategy)
     run, times = _timed(repeat, lambda: closed_loop.run(cycle, car, settings, table, FRICTION, dt_s=dt_s))
-    return times | {"exact": f"series {hashlib.sha256(run.series.tobytes()).hexdigest()[:8]}"}
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    plant_s = _plant_s(run, car.params, dt_s) if repeat > 1 else 0.0
+    rest_s = statistics.median(times["clock_s"]) - plant_s
+    return times | {
+        "peak_mb": peak_mb,
+        "parts": {"simulated car": plant_s, "law and driver": rest_s},
+        "series": hashlib.sha256(run.series.tobytes()).hexdigest()[:8],
+        "exact": _step_error(run, car.params, dt_s),
+    }
+
+
+def _plant_s(run: Any, car: Any, dt_s: float) -> float:
+    """What the simulated car takes of a drive: its steps alone, on the torques of the drive."""
+    import numba
+
+    from iwm_sim.plant import Surroundings, advance, initial_plant
+
+    @numba.njit
+    def steps(state, torques, surroundings, car):
+        for k in range(len(torques)):
+            a, b, c, d = torques[k]
+            state = advance(state, (a, a, b, b), (c, c, d, d), 0.0, surroundings, dt_s, 1, car)
+        return state.speed_mps
+
+    names = ("front_motor_nm", "rear_motor_nm", "front_friction_nm", "rear_friction_nm")
+    torques = np.column_stack([run[name] for name in names])
+    around = Surroundings((FRICTION,) * 4, 0.0, 0.0)
+    _, times = _timed(3, lambda: steps(initial_plant(car, 0.8, float(run["speed_mps"][0])), torques, around, car))
+    return statistics.median(times["clock_s"])
+
+
+def _step_error(run: Any, car: Any, dt_s: float, seconds: float = 0.2) -> str:
+    """Of the simulated car, on torques of the drive, beside the equations of motion integrated by SciPy."""
+    sys.path.insert(0, str(ROOT / "test"))
+    from iwm_sim.plant import Surroundings, advance, initial_plant
+    from oracles.physics import dynamics
+
+    front, rear, front_brake, rear_brake = (
+        run[f"{axle}_{kind}_nm"] for kind in ("motor", "friction") for axle in ("front", "rear")
+    )
+    moving = np.flatnonzero((run["speed_mps"] > 3.0) & (np.abs(front) > 1.0) & (np.abs(rear) > 1.0))
+    error = 0.0
+    for i in moving[:: len(moving) // 50]:
+        motors = (front[i], front[i], rear[i], rear[i])
+        brakes = (front_brake[i], front_brake[i], rear_brake[i], rear_brake[i])
+        speed = float(run["speed_mps"][i])
+        state = start = initial_plant(car, 0.8, speed)
+        for _ in range(round(seconds / dt_s)):
+            state = advance(state, motors, brakes, 0.0, Surroundings((FRICTION,) * 4, 0.0, 0.0), dt_s, 1, car)
+        resisting = tuple(-torque for torque in brakes)
+        true, _ = dynamics(speed, start.wheel_speed_radps, motors, resisting, 0.0, (FRICTION,) * 4, seconds, car)
+        error = max(error, abs(state.speed_mps - true))
+    return f"speed after {seconds:g} s within {1e3 * error:.2g} mm/s of its oracle"
 
 
 def imports(_: int) -> dict[str, Any]:
@@ -208,48 +339,68 @@ def imports(_: int) -> dict[str, Any]:
     return {"cpu_s": [time.process_time() - started], "exact": ""}
 
 
-def quantecon(repeat: int) -> dict[str, Any]:
+def quantecon(repeat: int, size: tuple[int, int] | None = None) -> dict[str, Any]:
     """The peer: the same problem as a sparse matrix, by QuantEcon's modified policy iteration to the same tolerance."""
     import quantecon.markov as markov
-    from scipy.sparse import coo_matrix, vstack
 
-    from iwm_power_manager.mdp.export import arrays_of
     from iwm_power_manager.mdp.transitions import build_model
 
-    problem, car, demand = _paper()
+    problem, car, demand = _sized(*size) if size else _paper()
     model = build_model(problem, car, FRICTION, demand)
     solution = _solved(problem, model)
-    data = arrays_of(model)
+    resource.setrlimit(resource.RLIMIT_AS, (PEER_LIMIT, PEER_LIMIT))
     started = time.process_time()
-    cells, powers = int(np.prod(data["cell_shape"])), demand.shape[1]
+    try:
+        states, actions, cost, matrix = _pairs(model, demand[0])
+        built = time.process_time()
+        peer = markov.DiscreteDP(-cost, matrix, problem.discount, states, actions)
+        made = time.process_time()
+        found, times = _timed(
+            repeat,
+            lambda: peer.solve(
+                method="modified_policy_iteration", epsilon=2.0 * problem.tolerance_j, max_iter=problem.max_iterations
+            ),
+        )
+    except MemoryError:
+        return {"cpu_s": [], "exact": f"needs more than {PEER_LIMIT / 2**30:g} GB"}
+    apart = float(np.max(np.abs(found.v + solution.cost_j.ravel())))
+    return {
+        "cpu_s": [made - started + seconds for seconds in times["cpu_s"]],
+        "exact": f"matrix {built - started:.2f} s + constructor {made - built:.2f} s + solve "
+        f"{statistics.median(times['cpu_s']):.2f} s; {apart:.1e} J from ours",
+    }
+
+
+def _pairs(model: Any, demand: Any) -> tuple[Any, Any, Any, Any]:
+    """State, control, cost and sparse successors of every pair, in the order of states and controls."""
+    from scipy.sparse import coo_matrix, vstack
+
+    from iwm_power_manager.mdp.export import NO_CHOICE, arrays_of
+
+    data = arrays_of(model)
+    cells, (shares, _) = int(np.prod(data["cell_shape"])), data["switching_j"].shape
     kept = np.isfinite(data["cost_j"])
     power, cell, control, cost, successor, weight = (
         data[name][kept] for name in ("power", "cell", "control", "cost_j", "successor", "weight")
     )
-    order = np.lexsort((control, power * cells + cell))
+    share = np.arange(shares)[:, None]
+    free, control = control != NO_CHOICE, np.maximum(control, 0)
+    after = (np.where(free, control, share) if shares > 1 else 0 * share + 0 * control).ravel()
+    cost = (cost + np.where(free, data["switching_j"][share, control], 0.0)).ravel()
+    states, actions = ((power * shares + share) * cells + cell).ravel(), np.tile(control, shares)
+    row, order = np.tile(np.arange(power.size), shares), np.lexsort((actions, states))
     blocks = []
-    for p in range(powers):
-        rows = order[power[order] == p]
-        next_p = np.flatnonzero(demand[0, p])
-        columns = (next_p[None, :, None] * cells + successor[rows][:, None, :]).reshape(rows.size, -1)
-        values = (demand[0, p, next_p][None, :, None] * weight[rows][:, None, :]).reshape(rows.size, -1)
+    for p, following in enumerate(demand):
+        pairs = order[power[row[order]] == p]
+        next_p = np.flatnonzero(following)
+        base = (next_p[None, :] * shares + after[pairs][:, None]) * cells
+        columns = (base[:, :, None] + successor[row[pairs]][:, None, :]).reshape(pairs.size, -1)
+        values = (following[next_p][None, :, None] * weight[row[pairs]][:, None, :]).reshape(pairs.size, -1)
         used = values > 0.0
-        places = np.broadcast_to(np.arange(rows.size)[:, None], used.shape)
-        blocks.append(coo_matrix((values[used], (places[used], columns[used])), (rows.size, powers * cells)).tocsr())
-    matrix = vstack(blocks, format="csr")
-    built = time.process_time()
-    states, actions = (power * cells + cell)[order], np.maximum(control[order], 0)
-    peer = markov.DiscreteDP(-cost[order], matrix, problem.discount, states, actions)
-    made = time.process_time()
-    found, times = _timed(
-        repeat, lambda: peer.solve(method="modified_policy_iteration", epsilon=2.0 * problem.tolerance_j)
-    )
-    apart = float(np.max(np.abs(found.v + solution.cost_j.ravel())))
-    return {
-        "cpu_s": [built - started + made - built + seconds for seconds in times["cpu_s"]],
-        "exact": f"matrix {built - started:.2f} s + constructor {made - built:.2f} s + solve "
-        f"{statistics.median(times['cpu_s']):.2f} s; {apart:.1e} J from ours",
-    }
+        places = np.broadcast_to(np.arange(pairs.size)[:, None], used.shape)
+        shape = (pairs.size, len(demand) * shares * cells)
+        blocks.append(coo_matrix((values[used], (places[used], columns[used])), shape).tocsr())
+    return states[order], actions[order], cost[order], vstack(blocks, format="csr")
 
 
 CHILDREN: dict[str, Callable[[int], dict[str, Any]]] = {
@@ -262,26 +413,34 @@ CHILDREN: dict[str, Callable[[int], dict[str, Any]]] = {
     "lookahead": lambda repeat: drive("sdp_lookahead", 0.01, repeat),
     "imports": imports,
     "quantecon": quantecon,
+    "naive": naive,
+    **{name: (lambda size: lambda _: states(*size))(row.size) for name, row in ROWS.items() if row.size},
+    **{f"quantecon_{name}": functools.partial(quantecon, size=row.size) for name, row in ROWS.items() if row.size},
 }
 
 
 def measured(name: str, repeat: int, checkout: Path) -> dict[str, Any]:
     """One row in a process of its own, with the code of a checkout."""
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
-    for times in (1, repeat):  # what the first one may have to compile takes memory, too
+    for times in (
+        (1, repeat) if name in ROWS and not ROWS[name].size else (repeat,)
+    ):  # what the first one may have to compile takes memory, too
         command = [sys.executable, "-P", __file__, "--child", name, "--repeat", str(times)]
         made = subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True)
     return dict(json.loads(made.stdout.splitlines()[-1]))
 
 
 def seconds(found: dict[str, Any] | None) -> str:
-    """Median and spread of a row, and what it takes beside."""
+    """Median and spread of a row, its parts on the clock, and what it takes beside."""
     if not found:
         return "-"
     times = found["cpu_s"]
+    if not times:
+        return str(found["exact"])
     spread = f" ({min(times):.3g} to {max(times):.3g})" if len(times) > 1 else ""
     clock = f", {statistics.median(found['clock_s']):.3g} s on the clock" if "clock_s" in found else ""
-    return f"{statistics.median(times):.3g} s{spread}{clock}, {found['peak_mb']:.0f} MB"
+    parts = " + ".join(f"{name} {part_s:.3g}" for name, part_s in found.get("parts", {}).items())
+    return f"{statistics.median(times):.3g} s{spread}{clock}{f': {parts}' * bool(parts)}, {found['peak_mb']:.0f} MB"
 
 
 def table(results: dict[str, Any]) -> str:
@@ -301,18 +460,115 @@ def table(results: dict[str, Any]) -> str:
         theirs = f"{row.peer}: {seconds(of_peer)}" if of_peer else "-"
         before, now = found.get("before"), found["now"]
         exact = now["exact"]
-        if before and exact.startswith("series"):
-            exact = "same bits as before" if before["exact"] == exact else "not the bits of before"
-        if of_peer and of_peer.get("exact"):
+        if before and "series" in now:
+            exact += ", same bits as before" if before["series"] == now["series"] else ", not the bits of before"
+        if of_peer and of_peer.get("exact") and of_peer["cpu_s"]:
             exact = f"{exact}; peer: {of_peer['exact']}"
         goal = f"{row.goal()}: {'met' if row.met(now, of_peer) else 'missed'}" if row.goal() else ""
         lines.append(f"| {row.what} | {theirs} | {seconds(before)} | {seconds(now)} | {goal} | {exact} |")
+    for name, (_, rows_of) in PROGRAMS.items():
+        if name in results["programs"]:
+            lines += [f"| {' | '.join(cells)} |" for cells in rows_of(results["programs"][name])]
     return "\n".join(lines)
 
 
-def _peer(name: str, options: argparse.Namespace) -> dict[str, Any] | None:
+# --- what has a program of its own: its command, and its rows ---------------------------------------------------------
+
+
+def _compared(what: str, goal: float, peer: str, theirs: float, ours: float) -> tuple[str, ...]:
+    """A row of rates, with what the ratio has to be (0: anything)."""
+    wanted = f"{goal:g} of the peer: {'met' if ours >= goal * theirs else 'missed'}" if goal else ""
+    return what, f"{peer}: {theirs:,.0f}", "-", f"{ours:,.0f}", wanted, f"{ours / theirs:.2f} of the peer"
+
+
+def bag_rows(found: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Writing, reading and replaying."""
+    write, read, unit = found["write"], found["read"], "messages per second of processor"
+    plain = read["AnyReader with deserialisation"]
+    return [
+        _compared(f"bags, write, {unit}", 0.0, "rosbags", write["rosbags, zstd"], write["BagWriter, zstd"]),
+        _compared(
+            f"bags, record: queue, thread, disk, {unit}",
+            0.8,
+            "rosbags",
+            write["rosbags, zstd"],
+            write["recorder: queue + thread + sync, zstd"],
+        ),
+        _compared(f"bags, read, {unit}", 0.0, "rosbags", read["AnyReader, raw"], read["BagReader, raw"]),
+        _compared(
+            f"bags, replay with control, {unit}",
+            1.0,
+            "bare reading with deserialisation, rosbags",
+            plain,
+            read["replay with control, compared"],
+        ),
+    ]
+
+
+def start_rows(found: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Cold start, warm start, and the slowest `--help`."""
+
+    def cells(what: str, times: list[list[float]], goal: float, note: str = "") -> tuple[str, ...]:
+        clock_s, cpu_s = (statistics.median(column) for column in zip(*times, strict=True))
+        wanted = f"{goal:g} s on the clock: {'met' if clock_s <= goal else 'missed'}" if goal < math.inf else ""
+        return what, "-", "-", f"{cpu_s:.3g} s, {clock_s:.3g} s on the clock", wanted, note
+
+    helps = {name: times for name, times in found.items() if name.endswith("--help")}
+    slowest = max(helps, key=lambda name: statistics.median(clock for clock, _ in helps[name]))
+    return [
+        cells("first command, empty kernel cache", found["this"]["cold"], math.inf),
+        cells("first command, full kernel cache", found["this"]["warm"], math.inf),
+        cells("node until its first step, full kernel cache", found["power_manager"], math.inf),
+        cells(f"`--help`, slowest of {len(helps)}", helps[slowest], 0.5, f"`{slowest}`"),
+    ]
+
+
+def fleet_rows(found: dict[str, Any]) -> list[tuple[str, ...]]:
+    """A study on both cores, and the same with a worker that dies."""
+    alone_s = found["serial_cpu_s"]
+    rows = []
+    for row in found["settings"]:
+        if (row["workers"], row["batch_s"]) == (2, 2.0):
+            goal = f"cores above 95 % busy: {'met' if row['busy_percent'] > 95.0 else 'missed'}"
+            rows.append(
+                (
+                    f"{found['drives']} drives, two workers{', one killed half-way' * row['killed']}",
+                    f"one process: {alone_s:.3g} s",
+                    "-",
+                    f"{row['wall_s']:.3g} s on the clock",
+                    "" if row["killed"] else goal,
+                    f"rows of one process, bit for bit; cores {row['busy_percent']:.1f} % busy",
+                )
+            )
+    return rows
+
+
+PROGRAMS: dict[str, tuple[list[str], Callable[[dict[str, Any]], list[tuple[str, ...]]]]] = {
+    "bags": (["bags.py", "--messages", "50000", "--steps", "3000"], bag_rows),
+    "start": (["cold_start.py"], start_rows),
+    "fleet": (["fleet.py"], fleet_rows),
+}
+
+
+def _of_program(name: str, page: Path | None) -> dict[str, Any]:
+    """What a program measured; that of the fleet writes the page beside this one, too."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "found.json"
+        beside: list[str | Path] = []
+        if page and name == "fleet":
+            path, beside = page.with_name("scale.json"), ["--page", page.with_name("scale.md")]
+        script, *given = PROGRAMS[name][0]
+        command = [sys.executable, Path(__file__).with_name(script), *given, "--json", path, *beside]
+        subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True, stdout=sys.stderr)
+        return dict(json.loads(path.read_text()))
+
+
+def _peer(row: str, options: argparse.Namespace) -> dict[str, Any] | None:
+    name = ROWS[row].peer
     if name == "quantecon":
-        return measured(name, 1, ROOT)
+        return measured(f"quantecon_{row}" if ROWS[row].size else name, 1, ROOT)
+    if name == "naive":
+        return measured(name, options.repeat, ROOT)
     if name == "fastsim" and options.fastsim:
         made = subprocess.run(
             [options.fastsim, "-c", FASTSIM, str(options.repeat)], check=True, stdout=subprocess.PIPE, text=True
@@ -325,7 +581,9 @@ def _peer(name: str, options: argparse.Namespace) -> dict[str, Any] | None:
 def main() -> None:
     """Measure the rows, print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", nargs="+", choices=list(ROWS), default=list(ROWS), help="default: all")
+    every = [*ROWS, *PROGRAMS]
+    words = "default: all; the others stay as they stand in --json"
+    parser.add_argument("--rows", nargs="+", choices=every, default=every, help=words)
     parser.add_argument("--repeat", type=int, default=5, help="timed runs of each row (default: %(default)s)")
     parser.add_argument("--before", type=Path, metavar="FOLDER", help="an earlier checkout")
     parser.add_argument("--fastsim", metavar="PYTHON", help="an interpreter with benchmarks/requirements.txt")
@@ -335,25 +593,33 @@ def main() -> None:
     options = parser.parse_args()
     if options.child:
         found = CHILDREN[options.child](options.repeat)
-        print(json.dumps(found | {"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0}))
+        print(json.dumps({"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0} | found))
         return
     processor = platform.processor() or platform.machine()
     with contextlib.suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         processor = next(line.split(": ")[1] for line in lines if line.startswith("model name"))
+    known = Path(options.json or "")
+    stored = json.loads(known.read_text()) if options.rows != every and known.is_file() else {}
     results: dict[str, Any] = {
         "machine": f"{processor}, {os.cpu_count()} cores, Python {platform.python_version()}",
         "repeat": options.repeat,
-        "load": os.getloadavg()[0],
-        "rows": {},
+        "load": max(os.getloadavg()[0], stored.get("load", 0.0)),
+        "rows": stored.get("rows", {}),
+        "programs": stored.get("programs", {}),
     }
     for name in options.rows:
-        row = {"before": measured(name, options.repeat, options.before.resolve())} if options.before else {}
-        row["now"] = measured(name, options.repeat, ROOT)
-        if peer := _peer(ROWS[name].peer, options):
-            row["peer"] = peer
-        results["rows"][name] = row
-        print(f"{name}: {seconds(row['now'])}", file=sys.stderr, flush=True)
+        began = time.perf_counter()
+        if name in PROGRAMS:
+            results["programs"][name] = _of_program(name, options.page)
+        else:
+            compared = options.before and not ROWS[name].size
+            row = {"before": measured(name, options.repeat, options.before.resolve())} if compared else {}
+            row["now"] = measured(name, options.repeat, ROOT)
+            if peer := _peer(name, options):
+                row["peer"] = peer
+            results["rows"][name] = row
+        print(f"{name}: measured in {time.perf_counter() - began:.0f} s", file=sys.stderr, flush=True)
     text = table(results)
     print(text)
     if options.json:

@@ -71,7 +71,10 @@ def test_a_mistake_ends_in_one_line(arguments, words, tmp_path, capsys):
     assert not (tmp_path / "x").exists()
 
 
-def test_ctrl_c_leaves_whole_parts_and_no_process_and_the_study_goes_on(hill, tmp_path):
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGKILL])
+def test_a_study_that_is_stopped_leaves_whole_parts_and_no_process_and_ends_with_the_rows_of_one_that_was_not(
+    stop, hill, tmp_path
+):
     study = tmp_path / "study"
     roads = [f"{0.3 + 0.001 * k:.3f}" for k in range(250)]
     (tmp_path / "many.yaml").write_text(
@@ -88,14 +91,21 @@ def test_ctrl_c_leaves_whole_parts_and_no_process_and_the_study_goes_on(hill, tm
         assert started.poll() is None
         os.sched_yield()
     children = psutil.Process(started.pid).children(recursive=True)
-    os.killpg(started.pid, signal.SIGINT)  # as a terminal does
+    if stop == signal.SIGINT:
+        os.killpg(started.pid, stop)  # as a terminal does
+    else:
+        started.kill()
     printed = started.communicate(timeout=120)
-    assert started.returncode == 130
+    assert started.returncode == (130 if stop == signal.SIGINT else -stop)
     assert b"Traceback" not in b"".join(printed)
     assert not psutil.wait_procs(children, timeout=60)[1]
-    assert all(path.suffix == ".parquet" for path in (study / "rows").iterdir())
+    assert stop == signal.SIGKILL or all(path.suffix == ".parquet" for path in (study / "rows").iterdir())
     known = Store(study).table(Drive).num_rows
     assert 0 < known < 250
     assert fleet.main([*command, "--batch", "60", "--jobs", "1", "--quiet", "--json", str(tmp_path / "out.json")]) == 0
     assert json.loads((tmp_path / "out.json").read_text())["drive"]["known"] == known
-    assert Store(study).table(Drive).num_rows == 250
+    alone = ["drive", str(tmp_path / "many.yaml"), "--output", str(tmp_path / "alone"), "--jobs", "1", "--quiet"]
+    assert fleet.main(alone) == 0
+    rows = Store(study).table(Drive)
+    assert rows.num_rows == 250
+    assert rows.equals(Store(tmp_path / "alone").table(Drive))
