@@ -3,8 +3,8 @@
 
     ros2 launch iwm_power_manager replay.launch.py bag:=drive_01
 
-The player publishes the bag's inputs with its own /clock; the power manager runs on that time. `--show-args` lists
-every argument.
+Once the power manager is active, the player publishes the bag's inputs with its own /clock, on which it runs.
+`--show-args` lists every argument.
 """
 
 from pathlib import Path
@@ -14,7 +14,8 @@ from launch.actions import DeclareLaunchArgument, EmitEvent, ExecuteProcess, Reg
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from launch_ros.actions import LifecycleNode
+from launch_ros.event_handlers import OnStateTransition
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import ExecutableInPackage
 
@@ -38,7 +39,7 @@ def generate_launch_description() -> LaunchDescription:
     share = Path(get_package_share_directory(PACKAGE))
     chosen = {name: LaunchConfiguration(name) for name, _, _ in ARGUMENTS}
     texts = ("signals_file", "vehicle_file", "policy_file", "strategy")
-    power_manager = Node(
+    power_manager = LifecycleNode(
         package=PACKAGE,
         executable="power_manager",
         name="power_manager",
@@ -51,10 +52,14 @@ def generate_launch_description() -> LaunchDescription:
     )
     command = [ExecutableInPackage("replay", PACKAGE), chosen["bag"], "--publish", "--rate", chosen["rate"]]
     player = ExecuteProcess(cmd=command, output="screen")
-    end = RegisterEventHandler(
-        OnProcessExit(target_action=player, on_exit=[EmitEvent(event=Shutdown(reason="the bag has ended"))])
+    play = RegisterEventHandler(
+        OnStateTransition(target_lifecycle_node=power_manager, goal_state="active", entities=[player])
     )
+    ends = [
+        RegisterEventHandler(OnProcessExit(target_action=process, on_exit=[EmitEvent(event=Shutdown(reason=reason))]))
+        for process, reason in ((player, "the bag has ended"), (power_manager, "the power manager has ended"))
+    ]
     arguments = [
         DeclareLaunchArgument(name, default_value=default, description=meaning) for name, default, meaning in ARGUMENTS
     ]
-    return LaunchDescription([*arguments, power_manager, player, end])
+    return LaunchDescription([*arguments, play, *ends, power_manager])

@@ -23,11 +23,11 @@ from iwm_power_manager.policy import choose, load_policy_bank
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.contract import (
     FRICTION_BRAKE_COMMAND,
+    JOINT_STATE,
     POWER_MANAGER_STATE,
     WHEEL_NAMES,
     WHEEL_TORQUE_COMMAND,
 )
-from iwm_power_manager.signals.mapping import JOINT_STATE
 from iwm_power_manager.signals.readings import joint_state_writer
 from iwm_power_manager.signals.types import definition_of, standard_types
 from iwm_power_manager.vehicle import load_vehicle

@@ -38,6 +38,8 @@ FRICTION = "road_friction"
 _NS_PER_S = 1e9
 #: Refused for what was accepted before, not for what they are.
 _REFUSED_BY_ANOTHER = (Violation.TOO_FAST, Violation.STAMP_NOT_NEWER)
+#: Speeds that agree differ by no more than this, and this part of the largest.
+_SAME_MPS, _SAME = 0.5, 0.1
 #: The battery comes a tenth as often as the other inputs.
 _SLOW = 10.0
 
@@ -207,6 +209,12 @@ class InputMonitor:
     def driven(self) -> bool:
         """A speed and a demand have been accepted: the least a step needs beside wheel speeds."""
         return self.tallies[SPEED].accepted_ns is not None and self.tallies[DEMAND].accepted_ns is not None
+
+    @property
+    def agree(self) -> bool:
+        """`vehicle_speed` and all wheels show the same motion."""
+        shown = [self.speed_mps, *(speed * self._limits.radius_m for speed in self.wheel_speed_radps)]
+        return max(shown) - min(shown) <= _SAME_MPS + _SAME * max(map(abs, shown))
 
     def take_speed(self, reading: SpeedReading, now_ns: int) -> bool:
         """Judge `vehicle_speed`; True if it was accepted."""

@@ -125,7 +125,7 @@ class Announcements:
         ----------
         controller : with its monitor
         topics : of each input
-        trouble : why a topic is not heard, by topic
+        trouble : why a topic is not heard, or not well, by topic
         wheel_names : the wheels in their order
         now_ns : the node's clock
         heard_ns : when the last message came on each topic, by that clock
@@ -187,9 +187,10 @@ class Announcements:
         parts = []
         for bit, name in STALE_NAMES.items():
             tally = controller.monitor.tallies[name]
-            if not stale & bit or (stale == ~0 and tally.accepted_ns is not None):
-                continue
             found = topics.get(name, ())
+            came = stale == ~0 and tally.accepted_ns is not None and not trouble.keys() & found
+            if came or not stale & bit:
+                continue
             silent = tuple(topic for topic in found if topic in trouble) or self._silent(found, now_ns)
             reason = "; ".join(dict.fromkeys(trouble[topic] for topic in silent if topic in trouble))
             if not reason and tally.why():

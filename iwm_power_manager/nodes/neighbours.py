@@ -20,7 +20,7 @@ class Neighbours(NamedTuple):
     ----------
     statuses : for `/diagnostics`
     problems : a line each
-    unheard : why a topic is not heard, by topic
+    unheard : why a topic is not heard, or not well, by topic
     """
 
     statuses: list[diagnostics.Status]
@@ -28,8 +28,8 @@ class Neighbours(NamedTuple):
     unheard: dict[str, str]
 
 
-def look(node: Node, inputs: Inputs, outputs: Outputs) -> Neighbours:
-    """Look at the graph as it is now."""
+def look(node: Node, inputs: Inputs, outputs: Outputs, slow: dict[str, str]) -> Neighbours:
+    """Look at the graph as it is now; `slow` tells of topics that are heard, but not as often as they should be."""
     types = inputs.types | outputs.types
     commanders = {topic: node.count_publishers(topic) for topic in outputs.topics}
     deaf = _lines(mismatched_subscribers(node, outputs.publishers, types))
@@ -41,15 +41,16 @@ def look(node: Node, inputs: Inputs, outputs: Outputs) -> Neighbours:
     unheard = _lines(mismatches)
     senders = {found.topic_name: node.count_publishers(found.topic_name) for found in inputs.subscriptions}
     several = _shared(senders)
-    if unheard or several:
+    heard_badly = [*unheard, *several, *_lines(slow)]
+    if heard_badly:
         level = diagnostics.ERROR if unheard else diagnostics.WARN
-        statuses.append(diagnostics.Status("input topics", level, "; ".join([*unheard, *several]), {}))
+        statuses.append(diagnostics.Status("input topics", level, "; ".join(heard_badly), {}))
     silent = {
         topic: "no message" if count else "no publisher"
         for topic, count in senders.items()
         if not count or topic not in inputs.heard_ns
     }
-    return Neighbours(statuses, [*wrong, *unheard, *several], silent | mismatches)
+    return Neighbours(statuses, [*wrong, *heard_badly], slow | silent | mismatches)
 
 
 def _lines(reasons: dict[str, str]) -> list[str]:

@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Collection, Mapping, Sequence
+from itertools import pairwise
+from math import inf
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -31,6 +34,19 @@ from iwm_power_manager.signals.types import types_of
 #: The queue of each stamped input of a lock-step set.
 _QUEUES: dict[type, int] = {SpeedReading: SPEED, JointReading: WHEELS, BatteryReading: BATTERY}
 _NS_PER_S = 1_000_000_000
+#: A rate is that of so many messages at most, and of so many at least.
+_MOST_SENT, _FEWEST_SENT = 32, 5
+#: Slower than this part of the rate that was said is another rate.
+_SLOW = 0.6
+#: After so many periods without a message a topic is silent, and not slow.
+_SILENT = 4.0
+
+
+def rate_hz(sent_ns: Collection[int]) -> float:
+    """Rate of messages sent at these times, the longest pause left out; infinite for too few to tell."""
+    gaps_ns = [later - sooner for sooner, later in pairwise(sent_ns)]
+    together_ns = sum(gaps_ns) - max(gaps_ns, default=0)
+    return (len(gaps_ns) - 1) * _NS_PER_S / together_ns if len(sent_ns) >= _FEWEST_SENT and together_ns > 0 else inf
 
 
 class Inputs:
@@ -61,6 +77,8 @@ class Inputs:
         self._full = {topic: node.resolve_topic_name(topic) for topic in readers}
         self.types = {self._full[topic]: reader.read.types.name for topic, reader in readers.items()}
         self.heard_ns: dict[str, int] = {}
+        self._sent_ns = {topic: deque[int](maxlen=_MOST_SENT) for topic in self.types}
+        self._slow: dict[str, str] = {}
         for topic, reader in readers.items():
             kind = messages.message_class(reader.read.types.name)
             asked = _asked(reader, lockstep=on_demand is not None)
@@ -86,14 +104,18 @@ class Inputs:
     def drop_all(self) -> None:
         """Forget what has arrived."""
         self._intake.drop_all()
+        for sent_ns in self._sent_ns.values():
+            sent_ns.clear()
 
     def take(self, monitor: InputMonitor, now_ns: int) -> None:
         """Real time: judge what has arrived on every topic."""
         ahead_ns = now_ns - time.time_ns()  # of DDS, which tells when an unstamped message was sent
         for topic, reader in self._readers.items():
             for data, info in self._intake.take(topic):
+                sent_ns = info["source_timestamp"] + ahead_ns
                 self.heard_ns[self._full[topic]] = now_ns
-                for reading in reader(data, info["source_timestamp"] + ahead_ns):
+                self._sent_ns[self._full[topic]].append(sent_ns)
+                for reading in reader(data, sent_ns):
                     judge(monitor, reading, now_ns)
 
     def push_demand(self, queue: LockstepQueue, data: bytes, info: dict[str, Any]) -> None:
@@ -116,6 +138,28 @@ class Inputs:
                         queue.push(kind, reading.stamp_ns, info["source_timestamp"], reading)
                     else:
                         judge(monitor, reading, now_ns)
+
+    def slow(self, topics: Mapping[str, Sequence[str]], values: Mapping[str, Any], now_ns: int) -> dict[str, str]:
+        """Topics that come far more slowly than their period says, by full name, each with the rate; the same words
+        as long as it lasts.
+
+        Parameters
+        ----------
+        topics : of each of the controller's inputs, by full name
+        values : the node's parameters
+        now_ns : the node's clock
+        """
+        found = {}
+        for name in topics:
+            period_s = values.get(f"input_period_s.{name}", inf)  # friction may come when it likes
+            for topic in topics[name]:
+                hz = rate_hz(self._sent_ns[topic])
+                lasts = hz * (now_ns - self.heard_ns.get(topic, 0)) < _SILENT * _NS_PER_S
+                if hz * period_s < _SLOW and lasts:
+                    words = f"comes at {hz:.3g} Hz, not at {1.0 / period_s:.3g}: input_period_s.{name} is {period_s:g}"
+                    found[topic] = self._slow.get(topic, words)
+        self._slow = found
+        return found
 
     def how_to_hear(self, topic: str, msgtype: str) -> str:
         """What to write in the signals file to take a topic (full name) with another type; "" if that is not clear."""

@@ -35,6 +35,7 @@ from iwm_power_manager.nodes.starting import Starting
 from iwm_power_manager.ros import diagnostics, messages, realtime
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
 from iwm_power_manager.signals.commands import FRICTION
+from iwm_power_manager.signals.contract import NODE_FRICTION, NODE_STATE
 
 #: How often, and how far apart, the rest of a set is looked for once its demand is there; later the watchdog looks.
 _SET_PATIENCE = 20
@@ -174,7 +175,9 @@ class PowerManager(Starting):
         self.stop()
 
     def _adopt(self, prepared: Prepared) -> None:
-        """Drive with what was prepared."""
+        """Drive with what was prepared; `ConfigError` if its topics get in each other's way."""
+        own = [self.resolve_topic_name(topic) for topic in (NODE_STATE, NODE_FRICTION)]
+        prepared.mapping.check_topics(self.resolve_topic_name, own)
         self._says.prepared(prepared)
         values = self._values
         self._wheel_names = tuple(values["wheel_names"])
@@ -438,7 +441,8 @@ class PowerManager(Starting):
         if self._demand_log:
             statuses.append(self._demand_log.status())
         if self._active and self._inputs is not None and self._outputs is not None:
-            found = neighbours.look(self, self._inputs, self._outputs)
+            slow = {} if self._lockstep else self._inputs.slow(self._topics, self._values, self._now_ns())
+            found = neighbours.look(self, self._inputs, self._outputs, slow)
             self._unheard = found.unheard
             self._says.problems([*found.problems, *self._report.doubts])
             statuses += found.statuses

@@ -97,7 +97,8 @@ class PowerManagerReport:
                     self._wheel_names,
                 )
             )
-            sensors = diagnostics.sensors_status(self._doubted, self._steps, self._wheel_names)
+            agree = controller.monitor.agree
+            sensors = diagnostics.sensors_status(self._doubted, self._steps, self._wheel_names, agree=agree)
             if self._steps >= _FEW_STEPS:
                 self.doubts = [sensors.message] if sensors.level != diagnostics.OK else []
             statuses.append(sensors)

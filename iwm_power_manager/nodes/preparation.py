@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import DEMAND
 from iwm_power_manager.control.thresholds import actuator_limits, input_limits, supervision_limits
-from iwm_power_manager.errors import BagError, ConfigError, IwmError
+from iwm_power_manager.errors import BagError, ConfigError, IwmError, did_you_mean, spelled_like
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.ros import messages
@@ -24,7 +24,7 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.commands import CommandWriter
 from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, DEMANDS, PEDALS, SignalMapping, load_mapping
 from iwm_power_manager.signals.readings import Assembly, TopicReader, topic_readers
-from iwm_power_manager.signals.types import types_of
+from iwm_power_manager.signals.types import standard_types, types_of
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
 #: Preparing that takes longer than this is said.
@@ -129,9 +129,9 @@ def _check_installed(file: Path, key: str, msgtype: str) -> None:
         types_of(msgtype)
     except (ImportError, BagError, ValueError):
         problem = f"{msgtype} is not installed here"
-        raise ConfigError(
-            file, f"{key}.type", problem, "a type of a sourced workspace, such as std_msgs/msg/Float64"
-        ) from None
+        near = did_you_mean(spelled_like(msgtype, standard_types().fielddefs))
+        allowed = "a type of a sourced workspace, such as std_msgs/msg/Float64" + near
+        raise ConfigError(file, f"{key}.type", problem, allowed) from None
 
 
 class Preparation:

@@ -12,7 +12,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime
@@ -128,10 +128,11 @@ class Recorder(Node):
         self._leave_clock_to_the_recording()
         values = declare(self, PARAMETERS)
         mapping = load_mapping(resolve(values["signals_file"]))
+        mapping.check_topics(self.resolve_topic_name)
         commands = [sink.topic for sinks in mapping.commands.values() for sink in sinks]
         sources = [source.topic for signal in _LOOP for source in mapping.sources.get(signal, ())]
         wait_for = list(filter(None, values["wait_for"])) or [*sources, *commands, POWER_MANAGER_STATE]
-        self._wait_for = [self.resolve_topic_name(name) for name in wait_for]
+        self._wait_for = self._in_full("wait_for", wait_for)
         self._poll_s = values["poll_period_s"]
         self._exit_on_error = values["exit_on_error"]
         self._remote_parameters = RemoteParameters(self) if values["node_parameters"] else None
@@ -140,7 +141,7 @@ class Recorder(Node):
         self._held: list[Taken] = []
         self._raw = RawSubscriptions(
             self,
-            [self.resolve_topic_name(name) for name in (*values["topics"], *mapping.topics(), *commands) if name],
+            self._in_full("topics", filter(None, (*values["topics"], *mapping.topics(), *commands))),
             _pattern(values["regex"]),
             values["depth"],
             _learn,
@@ -166,6 +167,14 @@ class Recorder(Node):
         self._ready = False
         self._matched_since: float | None = None
         self._ready_publisher.publish(Bool(data=False))
+
+    def _in_full(self, parameter: str, names: Iterable[str]) -> list[str]:
+        """Full names of topics."""
+        try:
+            return list(map(self.resolve_topic_name, names))
+        except Exception as error:  # noqa: BLE001 - rclpy's own, which is no public one
+            problem = str(error).split(", at /")[0].removeprefix("failed to resolve name: ")
+            raise ParameterError(f"parameter {parameter}: {problem}") from None
 
     # --- main loop --------------------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Collection, Sequence
 
 from iwm_power_manager.bags.reader import BagReader, Message
+from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
 from iwm_power_manager.replay.steps import ReplayedStep
 from iwm_power_manager.signals.cdr import MessageReader, names_path
@@ -48,17 +49,15 @@ class RecordedCommand:
         self, bag: BagReader, mapping: SignalMapping, kind: str, sink: Sink, name: str, tolerance: float
     ) -> None:
         topic = bag.topics[name]
+        types = types_of(topic.type, topic.encoding, topic.definition)
+        if types.name != sink.type:
+            raise ConfigError(mapping.path, f"{sink.key}.type", f"{name} carries {types.name}, not {sink.type}")
         self.kind, self.name = kind, name
         self._names = tuple(sink.names[wheel] if sink.names else WHEEL_NAMES[wheel] for wheel in sink.wheels)
         self._write = CommandWriter(mapping.path, [sink])
         # What a message of less than double precision would hold, only its bytes tell.
         self._parts = parts_of(sink) if topic.type == JOINT_STATE else ()
-        self._read = MessageReader(
-            types_of(topic.type, topic.encoding, topic.definition),
-            [sink.field],
-            self._made,
-            names_path(sink.field) if sink.names else "",
-        )
+        self._read = MessageReader(types, [sink.field], self._made, names_path(sink.field) if sink.names else "")
         self.stamped = self._read.stamped
         self._comparer = TopicComparer(name, tolerance)
         self._sent: deque[tuple[int, int]] = deque(maxlen=_RECENT)

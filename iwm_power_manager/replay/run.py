@@ -24,9 +24,9 @@ from iwm_power_manager.replay.recorded import SignalStream, check_signals, first
 from iwm_power_manager.replay.steps import ReconstructedSteps, RecordedSteps, ReplayedStep
 from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.commands import CommandWriter
-from iwm_power_manager.signals.contract import NODE_FRICTION
+from iwm_power_manager.signals.contract import JOINT_STATE, NODE_FRICTION
 from iwm_power_manager.signals.contract import POWER_MANAGER_STATE as STATE
-from iwm_power_manager.signals.mapping import JOINT_STATE, SignalMapping, topic_named
+from iwm_power_manager.signals.mapping import SignalMapping, topic_named
 from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import definition_of
 

@@ -223,7 +223,7 @@ def motors_status(actuators: ActuatorState, wheel_names: Sequence[str]) -> Statu
     return Status("motors", level, message, values)
 
 
-def sensors_status(doubted_steps: Mapping[int, int], steps: int, wheel_names: Sequence[str]) -> Status:
+def sensors_status(doubted_steps: Mapping[int, int], steps: int, wheel_names: Sequence[str], *, agree: bool) -> Status:
     """Which speed sensors the law did not believe in most of its steps, because they contradict the others.
 
     Parameters
@@ -231,6 +231,7 @@ def sensors_status(doubted_steps: Mapping[int, int], steps: int, wheel_names: Se
     doubted_steps : steps in which it was not believed, by number of the wheel; 4 is `vehicle_speed`
     steps : steps since the last report
     wheel_names : the wheels in their order
+    agree : all of them show the same motion
     """
     names = [*(f"wheel {name}" for name in wheel_names), "vehicle_speed"]
     values = {
@@ -239,6 +240,9 @@ def sensors_status(doubted_steps: Mapping[int, int], steps: int, wheel_names: Se
     }
     contradicted = [name for number, name in enumerate(names) if 2 * doubted_steps.get(number, 0) > steps]
     problem = f"{', '.join(contradicted)} not believed: contradicts the others; right unit and scale?"
+    if agree and contradicted == names:
+        problem = "vehicle_speed and wheels agree, but not with the motion before: car, bench or bag started over? "
+        problem += "then deactivate and activate this node as well"
     return Status("sensors", *_worst([(WARN, problem)] if contradicted else []), values)
 
 

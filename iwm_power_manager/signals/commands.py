@@ -23,12 +23,14 @@ from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.files import check_choice, check_keys, check_number, dotted
 from iwm_power_manager.signals.cdr import MessageWriter, blank, field_kind, names_path, steps_of
 from iwm_power_manager.signals.contract import FRICTION_BRAKE_COMMAND, JOINT_STATE, WHEEL_TORQUE_COMMAND
-from iwm_power_manager.signals.types import Types, types_of
+from iwm_power_manager.signals.types import Types, full_name, types_of
 
 MOTOR, FRICTION = "motor_torque", "friction_torque"
 COMMANDS = (MOTOR, FRICTION)
 _WHEELS = len(WHEEL_NAMES)
 _UNITS = {"N m": 1.0}
+#: Largest factor, and one over the smallest.
+_MOST = 1e9
 
 
 class Sink(NamedTuple):
@@ -80,29 +82,43 @@ def read_commands(file: Path, content: Any) -> dict[str, tuple[Sink, ...]]:
             found[kind] = tuple(_one(file, f"{key}[{i}]", item, i) for i, item in enumerate(entry))
         else:
             found[kind] = (_all(file, key, entry),)
-    topics = [sink.topic for sinks in found.values() for sink in sinks]
-    for topic in topics:
-        if topics.count(topic) > 1:
-            raise ConfigError(file, "commands", f"{topic} stands twice", "a topic for each message")
     return found
 
 
-def _base(file: Path, key: str, entry: Any, more: list[str]) -> Mapping[str, Any]:
-    values = check_keys(file, entry, ["topic", "type", "field", "unit"], ["factor", "sign", *more], key)
-    for name in ("topic", "type", "field"):
-        if not isinstance(values[name], str) or not values[name]:
-            raise ConfigError(file, dotted(key, name), f"{values[name]!r} is no name")
+def _base(file: Path, key: str, entry: Any, more: list[str]) -> dict[str, Any]:
+    values = dict(check_keys(file, entry, ["topic", "type", "field", "unit"], ["factor", "sign", *more], key))
     check_choice(file, dotted(key, "unit"), values["unit"], _UNITS)
-    return values
+    return values | place(file, key, values)
+
+
+def place(file: Path, key: str, values: Mapping[str, Any]) -> dict[str, str]:
+    """Topic, field and type of an entry, the type's name in full; `ConfigError` for what cannot be one."""
+    for name in ("topic", "field", "type"):
+        if not isinstance(values.get(name, "x"), str) or not values.get(name, "x"):
+            raise ConfigError(file, dotted(key, name), f"{values[name]!r} is no name")
+    if steps_of(values["field"]) is None:
+        allowed = "names with a dot between, as in twist.linear.x, and indices, as in data[2]"
+        raise ConfigError(file, dotted(key, "field"), f"{values['field']!r} is no path", allowed)
+    try:
+        msgtype = full_name(values["type"]) if "type" in values else ""
+    except BagError:
+        problem = f"{values['type']!r} is no name of a message type"
+        raise ConfigError(file, dotted(key, "type"), problem, "package/msg/Type, as in std_msgs/msg/Float64") from None
+    return {"topic": values["topic"], "field": values["field"], "type": msgtype}
+
+
+def check_factor(file: Path, key: str, value: Any) -> float:
+    """A factor that does not make nothing, or anything, of a number."""
+    number = check_number(file, key, value)
+    if not 1.0 / _MOST <= abs(number) <= _MOST:
+        raise ConfigError(file, key, f"{value} is out of range", f"{1.0 / _MOST:g} to {_MOST:g}, or as far below 0")
+    return number
 
 
 def _factors(file: Path, key: str, factor: Any, *, wheels: bool) -> tuple[float, ...]:
     """A factor, or where wheels have one each, four; `ConfigError` for anything else."""
     found = factor if wheels and isinstance(factor, list) and len(factor) == _WHEELS else [factor]
-    numbers = tuple(check_number(file, key, one) for one in found)
-    if 0.0 in numbers:
-        raise ConfigError(file, key, "0 is not allowed", "a number that is not 0" + (", or four" if wheels else ""))
-    return numbers
+    return tuple(check_factor(file, key, one) for one in found)
 
 
 def _one(file: Path, key: str, entry: Any, wheel: int) -> Sink:

@@ -14,21 +14,37 @@ Every signal ends up in SI units: value * factor * sign + offset, then the unit.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from iwm_power_manager.errors import BagError, ConfigError
+from iwm_power_manager.errors import BagError, ConfigError, one_line
 from iwm_power_manager.files import check_choice, check_keys, check_number, dotted, read_yaml
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.commands import FRICTION, Sink, read_commands, signs, standard, wheel_names
+from iwm_power_manager.signals.commands import (
+    FRICTION,
+    Sink,
+    check_factor,
+    place,
+    read_commands,
+    signs,
+    standard,
+    wheel_names,
+)
+from iwm_power_manager.signals.contract import CLOCK, DIAGNOSTICS, JOINT_STATE
 
 DEFAULT_MAPPING = "config/signals/standard.yaml"
 
 WHEELS = 4
-#: A JointState, whose names stand in its field `name`.
-JOINT_STATE = "sensor_msgs/msg/JointState"
+#: Largest offset.
+_OFFSET = 1e9
+_TOPIC = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+#: Longest name of a topic, with its namespace, that ROS allows.
+_LONGEST = 247
+#: Nobody's topics to command on or to take a number from.
+_OF_ROS = (DIAGNOSTICS, CLOCK, "/rosout", "/parameter_events")
 
 
 class Unit(NamedTuple):
@@ -182,6 +198,48 @@ class SignalMapping(NamedTuple):
             for source in sources:
                 if not source.type:
                     raise ConfigError(self.path, f"{source.key}.type", "is missing; a live signal needs it")
+        arrays: list[Source | Sink] = [one for sources in self.sources.values() for one in sources if one.of_all_wheels]
+        arrays += [one for sinks in self.commands.values() for one in sinks if len(one.wheels) > 1]
+        for one in arrays:
+            if one.type == JOINT_STATE and not one.names:
+                problem = "is missing; a JointState says by name which wheel is which"
+                raise ConfigError(self.path, f"{one.key}.names", problem, "four names, as in the message's `name`")
+
+    def check_topics(self, resolve: Callable[[str], str] | None = None, own: Iterable[str] = ()) -> None:
+        """Refuse topics that get in each other's way.
+
+        Parameters
+        ----------
+        resolve : full name of a topic, with namespace and remaps; then names that ROS cannot have are refused, too
+        own : full names of the topics the node publishes beside the commands
+
+        Raises
+        ------
+        ConfigError
+            A name is none, one topic has two names, or a command goes where something else comes from or goes to.
+        """
+        taken = dict.fromkeys(_OF_ROS, "is ROS's own") | dict.fromkeys(own, "is this node's own")
+        inputs: dict[str, Source] = {}
+        for source in (source for sources in self.sources.values() for source in sources):
+            full = self._resolved(source, resolve, taken)
+            first = inputs.setdefault(full, source)
+            if first.topic != source.topic:
+                problem = f"{source.topic} is {full}, and so is {first.topic} of {first.key}"
+                raise ConfigError(self.path, f"{source.key}.topic", problem, "the same name for the same topic")
+        taken |= {full: f"is an input as well ({source.key})" for full, source in inputs.items()}
+        for sink in (sink for sinks in self.commands.values() for sink in sinks):
+            taken[self._resolved(sink, resolve, taken)] = f"carries a command as well ({sink.key})"
+
+    def _resolved(self, one: Source | Sink, resolve: Callable[[str], str] | None, taken: dict[str, str]) -> str:
+        """Full name of a topic that is not taken."""
+        key = f"{one.key}.topic"
+        full = one.topic
+        if resolve and (not _TOPIC.fullmatch(full) or len(full := resolve(full)) > _LONGEST):
+            allowed = f"words of letters, digits and _ with a / between, {_LONGEST} characters at most: /wheels/speed_1"
+            raise ConfigError(self.path, key, f"{one_line(one.topic, 60)!r} is no name of a topic", allowed)
+        if full in taken:
+            raise ConfigError(self.path, key, f"{full} {taken[full]}", "a topic of its own")
+        return full
 
 
 def load_mapping(path: Path | str | None = None) -> SignalMapping:
@@ -205,29 +263,24 @@ def load_mapping(path: Path | str | None = None) -> SignalMapping:
         else:
             sources[signal] = (_source(file, key, signal, entry, wheels=signal in OF_WHEELS),)
     commands = read_commands(file, content["commands"]) if "commands" in content else standard()
-    return SignalMapping(file, sources, commands)
+    mapping = SignalMapping(file, sources, commands)
+    mapping.check_topics()
+    return mapping
 
 
 def _source(file: Path, key: str, signal: str, entry: Any, *, wheels: bool = False) -> Source:
     optional = ["type", "factor", "offset", "sign", "qos", "stamp", *(["names"] if wheels else [])]
     values = check_keys(file, entry, ["topic", "field", "unit"], optional, key)
-    for name in ("topic", "field", "type"):
-        if not isinstance(values.get(name, "x"), str) or not values.get(name, "x"):
-            raise ConfigError(file, dotted(key, name), f"{values[name]!r} is no name")
     units = UNITS[signal]
     unit = check_choice(file, dotted(key, "unit"), values["unit"], units)
     sign = signs(file, dotted(key, "sign"), values.get("sign", 1), wheels=wheels)
-    factor = check_number(file, dotted(key, "factor"), values.get("factor", 1.0))
-    if factor == 0.0:
-        raise ConfigError(file, dotted(key, "factor"), "0 is not allowed", "a number that is not 0")
+    factor = check_factor(file, dotted(key, "factor"), values.get("factor", 1.0))
     return Source(
         key=key,
-        topic=values["topic"],
-        field=values["field"],
+        **place(file, key, values),
         unit=units[unit],
-        type=values.get("type", ""),
         factor=factor * sign[0] if len(set(sign)) == 1 else factor,
-        offset=check_number(file, dotted(key, "offset"), values.get("offset", 0.0)),
+        offset=check_number(file, dotted(key, "offset"), values.get("offset", 0.0), -_OFFSET, _OFFSET),
         signs=sign if len(set(sign)) > 1 else (),
         names=wheel_names(file, dotted(key, "names"), values["names"]) if "names" in values else (),
         qos=check_choice(file, dotted(key, "qos"), values.get("qos", "best_effort"), RELIABILITIES),

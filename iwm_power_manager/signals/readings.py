@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from difflib import get_close_matches
+from difflib import SequenceMatcher
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,10 +28,10 @@ from iwm_power_manager.signals.cdr import (
     names_path,
     numbers_in,
 )
+from iwm_power_manager.signals.contract import JOINT_STATE
 from iwm_power_manager.signals.mapping import (
     BATTERY,
     DEMANDS,
-    JOINT_STATE,
     OF_WHEELS,
     PEDALS,
     SIGNALS,
@@ -340,7 +340,9 @@ def _check_source(file: Path, types: Types, source: Source) -> None:
 def field_like(source: Source, types: Types) -> str:
     """The field of a type that is most like that of a source; "" if none could be its."""
     found = numbers_in(types, array=source.of_all_wheels)
-    return next(iter(get_close_matches(source.field, found, 1, 0.0 if len(found) == 1 else 0.5)), "")
+    likeness = [SequenceMatcher(None, field, source.field).ratio() for field in found]
+    best = max(likeness, default=0.0)
+    return found[likeness.index(best)] if best >= 0.5 or len(found) == 1 else ""
 
 
 def _check_vehicle(file: Path, signal: str, source: Source, vehicle: VehicleParams | None) -> None:

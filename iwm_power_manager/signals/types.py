@@ -110,7 +110,7 @@ def _types_of(msgtype: str, encoding: str, text: str, wide: str) -> Types:
     from rosbags.typesys.store import Typestore
 
     try:
-        name = _normalised(msgtype)
+        name = full_name(msgtype)
         encoding = IDL if encoding == "omgidl" else encoding
         known: dict[str, Any] = _parsed(name, encoding, text) if text and encoding in (MSG, IDL) else {}
         given = _needed(name, known, wide)
@@ -137,7 +137,8 @@ def standard_types() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def _normalised(msgtype: str) -> str:
+def full_name(msgtype: str) -> str:
+    """`package/msg/Type` of `package/Type`; raises `BagError` for what is no name of a message type."""
     package, _, rest = msgtype.partition("/")
     kind, _, name = rest.rpartition("/")
     full = f"{package}/{kind or 'msg'}/{name}"

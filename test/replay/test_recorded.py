@@ -16,7 +16,8 @@ from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.model.pedals import pedal_power_w
 from iwm_power_manager.replay.recorded import SignalStream, read_signal
 from iwm_power_manager.share import share_path
-from iwm_power_manager.signals.mapping import JOINT_STATE, load_mapping
+from iwm_power_manager.signals.contract import JOINT_STATE
+from iwm_power_manager.signals.mapping import load_mapping
 from iwm_power_manager.signals.readings import joint_state_writer
 from iwm_power_manager.vehicle import load_vehicle
 

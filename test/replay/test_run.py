@@ -330,6 +330,19 @@ def test_a_command_recorded_under_another_name_is_named(
     assert "not in the bag; of its type: /torques; if it is one of them: --mapping with a copy" in line
 
 
+def test_a_command_topic_that_carries_another_type_is_not_compared(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copied(drive, tmp_path / "renamed", {"/battery_state": "/bms", "/wheel_torque_command": "/torques"})
+    text = share_path("config/signals/standard.yaml").read_text()
+    mapping = tmp_path / "signals.yaml"
+    mapping.write_text(text.replace("topic: battery_state", "topic: pack").replace("wheel_torque_command", "bms"))
+    main([str(tmp_path / "renamed"), "--compare", "--mapping", str(mapping)])
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "/bms" in line)
+    carries = "commands.motor_torque.type: /bms carries sensor_msgs/msg/BatteryState, not sensor_msgs/msg/JointState"
+    assert f"not compared: /bms: {mapping}: {carries}" in line
+
+
 def copied(drive: Path, path: Path, names: dict[str, str], *more: Topic) -> None:
     """The same bag with other names of topics, and a message of `more` topics, each of a state."""
     with BagReader(drive) as source, BagWriter(path) as bag:

@@ -77,18 +77,28 @@ def compiled_law() -> None:
     law.step(measurement, initial_state(), default_settings("equal"), vehicle, empty_table())
 
 
-@pytest.fixture(scope="module")
-def start_pair(tmp_path_factory: pytest.TempPathFactory, compiled_law: None) -> Iterator[Callable[..., Pair]]:
-    """Start a power manager with parameters; all end with the module."""
+def _pairs(folders: pytest.TempPathFactory) -> Iterator[Callable[..., Pair]]:
     pairs: list[Pair] = []
 
     def start(parameters: dict[str, Any] | None = None, **options: Any) -> Pair:
-        pairs.append(Pair(tmp_path_factory.mktemp("node"), parameters or {}, **options))
+        pairs.append(Pair(folders.mktemp("node"), parameters or {}, **options))
         return pairs[-1]
 
     yield start
     for pair in pairs:
         pair.close()
+
+
+@pytest.fixture(scope="module")
+def start_pair(tmp_path_factory: pytest.TempPathFactory, compiled_law: None) -> Iterator[Callable[..., Pair]]:
+    """Start a power manager with parameters; all end with the module."""
+    yield from _pairs(tmp_path_factory)
+
+
+@pytest.fixture
+def start_own(tmp_path_factory: pytest.TempPathFactory, compiled_law: None) -> Iterator[Callable[..., Pair]]:
+    """The same for one test, with which they end."""
+    yield from _pairs(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,7 @@ from iwm_power_manager.ros.diagnostics import (
     Status,
     control_status,
     motors_status,
+    sensors_status,
     to_message,
 )
 
@@ -160,6 +161,14 @@ class TestControl:
     def test_a_node_that_is_not_active_is_ok_and_says_what_it_is(self) -> None:
         status = control_status("inactive", Supervision(), 0, 0, {}, "sdp", CAR)
         assert (status.level, status.message) == (OK, "inactive")
+
+
+def test_sensors_that_agree_with_each_other_alone_are_not_put_down_to_a_unit() -> None:
+    wheels = ("fl", "fr", "rl", "rr")
+    all_five = dict.fromkeys(range(5), 100)
+    assert "started over? then deactivate" in sensors_status(all_five, 100, wheels, agree=True).message
+    for doubted, agree in ((all_five, False), (dict.fromkeys(range(4), 100), True)):
+        assert "right unit and scale?" in sensors_status(doubted, 100, wheels, agree=agree).message
 
 
 def test_the_message_carries_stamp_names_levels_and_values() -> None:

@@ -52,6 +52,25 @@ def test_a_destructor_that_never_returns_does_not_keep_the_process(code) -> None
         assert (ended.returncode, ended.stdout, ended.stderr) == (code, "", "")
 
 
+#: A command that has used DDS and leaves a thread behind that never ends.
+LEAVES_A_THREAD = """
+import sys, threading, types
+from iwm_power_manager import executables
+from iwm_power_manager.ros import ending
+ending.LIMIT_S = 0.3
+def main():
+    threading.Thread(target=threading.Event().wait).start()
+    return 3
+sys.modules["some_module"] = types.SimpleNamespace(main=main)
+sys.exit(executables.power_manager.func("some_module", 0))
+"""
+
+
+def test_a_thread_that_never_ends_does_not_keep_a_command() -> None:
+    ended = run(LEAVES_A_THREAD)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (3, "", "")
+
+
 #: Goes on for longer than leaving may take: nothing to wait for, it is the timer that must not come.
 GOES_ON = """
 import sys, time

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import Float64
 
 from iwm_power_manager.control.record import SIGNAL_NAMES
+from iwm_power_manager.nodes.power_manager_inputs import rate_hz
 from iwm_power_manager.ros import messages, qos
 
 NAN = math.nan
@@ -35,7 +37,13 @@ def normal(bench):
 def counter(bench, key: str) -> int:
     bench.diagnostics.clear()
     bench.drive(lambda: bench.status("inputs"), "a report")
-    return int({entry.key: entry.value for entry in bench.status("inputs").values}.get(key, "0"))
+    return reported(bench, key)
+
+
+def reported(bench, key: str) -> int:
+    """A counter in the last report that has come; 0 without one."""
+    status = bench.status("inputs")
+    return int({entry.key: entry.value for entry in status.values}.get(key, "0")) if status else 0
 
 
 def send_alone(bench, **inputs) -> None:
@@ -107,8 +115,8 @@ def test_a_missing_input_degrades_to_zero_torque_and_recovers(bench, without, bi
 
 def test_an_input_that_repeats_its_stamp_counts_as_missing(bench) -> None:
     frozen = bench.stamp()
+    bench.drive(lambda: reported(bench, "vehicle_speed: dropped, stamp not newer"), "the count", stamp_ns=frozen)
     bench.drive(lambda: int(bench.last("stale")) & 3 == 3, "degraded", stamp_ns=frozen)
-    assert counter(bench, "vehicle_speed: dropped, stamp not newer") > 0
 
 
 def test_wheels_are_matched_by_name(bench) -> None:
@@ -207,8 +215,8 @@ class TestDiagnostics:
         bench.node.destroy_publisher(weak)
 
 
-def test_a_motor_that_reports_no_torque_is_found_and_left_out(start_pair) -> None:
-    bench = start_pair().bench
+def test_a_motor_that_reports_no_torque_is_found_and_left_out(start_own) -> None:
+    bench = start_own().bench
     dead: set[int] = set()
 
     def commanded() -> tuple[float, ...]:
@@ -224,8 +232,8 @@ def test_a_motor_that_reports_no_torque_is_found_and_left_out(start_pair) -> Non
     assert "rear_left" in bench.status("motors").message
 
 
-def test_wheel_speeds_in_another_unit_are_named(start_pair) -> None:
-    pair = start_pair()
+def test_wheel_speeds_in_another_unit_are_named(start_own) -> None:
+    pair = start_own()
     bench = pair.bench
     bench.connect()
     bench.drive(lambda: bench.mode() == 1 and bench.status("sensors").level == DiagnosticStatus.OK, "believed sensors")
@@ -238,8 +246,42 @@ def test_wheel_speeds_in_another_unit_are_named(start_pair) -> None:
     bench.drive(lambda: any("over: " in line and said in line for line in log().splitlines()), "that it is over")
 
 
-def test_a_wheel_that_never_comes_is_named_while_the_others_drive(start_pair) -> None:
-    pair = start_pair()
+def test_a_bench_that_was_started_over_is_no_wrong_unit(start_own) -> None:
+    bench = start_own().bench
+    bench.connect()
+    bench.drive(lambda: bench.mode() == 1, "normal operation", demand=0.0)
+
+    def sensors() -> str:
+        return bench.status("sensors").message if bench.status("sensors") else ""
+
+    bench.drive(lambda: "started over? then deactivate" in sensors(), "the reason", speed=0.0, demand=0.0)
+    for transition in ("deactivate", "activate"):
+        assert bench.change_state(transition)
+    bench.diagnostics.clear()
+    bench.drive(lambda: bench.mode() == 1 and sensors() == "ok", "belief", speed=0.0, demand=0.0)
+
+
+def test_inputs_that_come_too_slowly_are_named_with_their_rate(start_own) -> None:
+    """Their periods were not said: the node that never starts to drive says why, again and again."""
+    pair = start_own()
+    bench = pair.bench
+    bench.connect()
+    comes = r"comes at [\d.]+ Hz, not at 100: input_period_s.vehicle_speed is 0.01"
+    for found in (rf"waits for .*/vehicle_speed \({comes}\)", rf"WARN.*/vehicle_speed: {comes}"):
+        bench.drive(lambda found=found: re.search(found, pair.running.text()), found, period_s=0.08)
+    said = bench.drive(lambda: bench.status("input topics"), "the rate in the diagnostics", period_s=0.08).message
+    assert re.search(f"/vehicle_speed: {comes}", said)
+
+
+def test_a_rate_is_told_whatever_pause_was_in_between() -> None:
+    fifty = [int(20e6 * i + (5e9 if i > 7 else 0)) for i in range(10)]
+    assert rate_hz(fifty) == pytest.approx(50.0)
+    assert rate_hz(fifty[:4]) == math.inf
+    assert rate_hz([1] * 9) == math.inf
+
+
+def test_a_wheel_that_never_comes_is_named_while_the_others_drive(start_own) -> None:
+    pair = start_own()
     pair.bench.connect()
     three = (10.0 / 0.33, 10.0 / 0.33, NAN, 10.0 / 0.33)
     pair.bench.drive(lambda: pair.bench.mode() == 1, "normal operation", wheels=three)

@@ -20,6 +20,41 @@ def mapping_file(folder: Path, text: str) -> Path:
     return path
 
 
+def test_a_short_name_of_a_type_is_the_long_one(tmp_path: Path) -> None:
+    path = mapping_file(tmp_path, "signals: {speed: {topic: x, type: std_msgs/Float64, field: data, unit: m/s}}")
+    assert load_mapping(path).sources["speed"][0].type == "std_msgs/msg/Float64"
+
+
+@pytest.mark.parametrize(
+    ("entries", "problem"),
+    [
+        ("topic: 'a b'", "signals.speed.topic: 'a b' is no name of a topic; allowed: words of letters, digits and _"),
+        *(
+            (f"topic: '{name}'", "is no name of a topic")
+            for name in ("/a//b", "/a/", "/", "/1", "/a-b", "/ö", "/a/~b", "/" + "a" * 300)
+        ),
+        ("topic: odom", "signals.soc.topic: /car/odom is /car/odom, and so is odom of signals.speed; allowed"),
+        ("topic: splitter/state", "signals.speed.topic: /car/splitter/state is this node's own"),
+        ("topic: /car/wheel_torque_command", "commands.motor_torque.topic: /car/wheel_torque_command is an input as"),
+    ],
+)
+def test_a_topic_is_refused_where_the_node_has_its_name_and_namespace(
+    tmp_path: Path, entries: str, problem: str
+) -> None:
+    soc = "soc: {topic: /car/odom, field: b, unit: '1'}"
+    mapping = load_mapping(mapping_file(tmp_path, f"signals: {{speed: {{{entries}, field: a, unit: m/s}}, {soc}}}"))
+    with pytest.raises(ConfigError, match=r"mapping\.yaml") as caught:
+        mapping.check_topics(lambda name: name if name.startswith("/") else f"/car/{name}", ["/car/splitter/state"])
+    assert problem in str(caught.value)
+
+
+def test_a_joint_state_needs_names_live(tmp_path: Path) -> None:
+    text = share_path("config/signals/odometry_and_pedals.yaml").read_text()
+    names = next(line for line in text.splitlines() if "names:" in line)
+    with pytest.raises(ConfigError, match=r"signals.wheel_speed.names: is missing; .*; allowed: four names"):
+        load_mapping(mapping_file(tmp_path, text.replace(names, ""))).check_live()
+
+
 @pytest.mark.parametrize("name", ["standard.yaml", "odometry_and_pedals.yaml", "four_topics.yaml"])
 def test_the_mappings_of_the_package_are_valid(name: str) -> None:
     load_mapping(share_path(f"config/signals/{name}")).check_live()
@@ -65,7 +100,17 @@ def test_a_topic_without_slash_is_found_in_its_namespace_unless_there_are_two() 
         ),
         ("signals: {speed: {topic: 3, field: data, unit: m/s}}", "signals.speed.topic: 3 is no name"),
         ("signals: {speed: {topic: x, field: data, unit: m/s, factor: .nan}}", "signals.speed.factor"),
-        ("signals: {speed: {topic: x, field: data, unit: m/s, factor: 0}}", "signals.speed.factor"),
+        ("signals: {speed: {topic: x, field: data, unit: m/s, factor: 0}}", "signals.speed.factor: 0 is out of range"),
+        ("signals: {speed: {topic: x, field: data, unit: m/s, factor: -1e300}}", "allowed: 1e-09 to 1e+09, or as far"),
+        ("signals: {speed: {topic: x, field: data, unit: m/s, offset: 1e300}}", "signals.speed.offset"),
+        ("signals: {speed: {topic: x, field: a..b, unit: m/s}}", "signals.speed.field: 'a..b' is no path; allowed"),
+        ("signals: {speed: {topic: x, field: 'data[-1]', unit: m/s}}", "signals.speed.field"),
+        ("signals: {speed: {topic: x, type: a.msg.B, field: data, unit: m/s}}", "allowed: package/msg/Type"),
+        (
+            "signals: {speed: {topic: wheel_torque_command, field: data, unit: m/s}}",
+            "commands.motor_torque.topic: wheel_torque_command is an input as well (signals.speed); allowed: a",
+        ),
+        ("signals: {speed: {topic: /diagnostics, field: data, unit: m/s}}", "speed.topic: /diagnostics is ROS's"),
         ("signals: {speed: {topic: x, field: data, unit: m/s, names: [a, b, c, d]}}", "names"),
         ("signals: {wheel_speed: {topic: x, field: data, unit: rpm, names: [a, a, b, c]}}", "four different names"),
         ("signals: {wheel_speed: [{topic: x, field: data, unit: rpm}]}", "signals.wheel_speed: 1 sources"),
