@@ -9,9 +9,11 @@ hand, and the marker says what prints it.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 
+from iwm_power_manager.control.budget import DEAREST, bucket
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
@@ -59,8 +61,8 @@ def measurements(text: str) -> list[str]:
 
 
 def without_blocks(text: str) -> str:
-    """A page without what is filled, and without code."""
-    return re.sub(r"```.*?```", "", _BLOCK.sub("", text), flags=re.DOTALL)
+    """A page without what is filled."""
+    return _BLOCK.sub("", text)
 
 
 def savings_table(study: Study) -> str:
@@ -135,10 +137,31 @@ def policies(study: Study) -> str:
     )
 
 
+def trials(_: Study) -> str:
+    """Prices that were tried for the shipped policy on a dry road, and what a full bucket of changes may cost."""
+    policy = load_policy(share_path("policies/jalalmaab_2015_drag_coupled_mu090.npz"))
+    tried = "".join(f"{trial.price_j:.4g}: {trial.changes_per_min:<8.3g}" for trial in policy.trials)
+    problem = policy.problem
+    rise = math.log(DEAREST) / bucket(problem.changes_per_min)
+    loss_j = problem.changes_per_min * problem.switching_cost_j * rise / 4.0
+    return (
+        f"Of the shipped policy (idle drive drag, friction {policy.friction:g}, {policy.identity}; all trials are in "
+        f"the file; b x price x a / 4, see below, is {loss_j:.1f} J a minute):\n\n"
+        f"```\nprice of a change, J: changes a minute\n  {tried.rstrip()}\n```"
+    )
+
+
+def policies_named(text: str) -> set[str]:
+    """Policies that a page's text names by grid and checksum, as results do: the first eight digits of each."""
+    named = r"(?:\bcoupled |\bpolic(?:y|ies) (?:coupled )?)((?:[0-9a-f]{8,64}(?:, (?:coupled )?)?)+)"
+    return {word[:8] for found in re.findall(named, text) for word in re.findall(r"[0-9a-f]{8,64}", found)}
+
+
 BLOCKS: dict[str, Callable[[Study], str]] = {
     "savings": savings_table,
     "summary": summary,
     "energy": energy,
     "by friction": by_friction,
     "policies": policies,
+    "trials": trials,
 }

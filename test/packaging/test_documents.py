@@ -13,12 +13,17 @@ from pathlib import Path
 import pytest
 
 import documents
+from iwm_power_manager.policy import load_policy
 from iwm_sim.study.content import Study
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
 #: A result: a number with decimals in a unit that drives or programs are measured in.
-FIGURE = re.compile(r"(?<![\w.])[-−+]?\d+\.\d+(?=\s?(?:%|points|Wh/km|(?:ms|us|µs|[kMG]i?B)\b))")
+FIGURE = re.compile(
+    r"(?<![\w.])[-−+]?\d+\.\d+"
+    r"(?=\s?(?:%|points|Wh/km|(?:ms|us|µs|[kMG]i?B|J|Wh|of (?:it|them|all)|(?:changes )?a minute|times|steps/s)\b))"
+)
+FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
 #: A table with so many numbers with decimals is one of results.
 MANY, DECIMAL, TABLE = 6, re.compile(r"(?<![\w.`-])[-−+]?\d+\.\d+(?![\w.`])"), re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 #: What a command writes as a whole or between markers of its own; other tests compare these.
@@ -57,10 +62,15 @@ def test_every_transcript_begins_with_its_command_which_there_is(page: Path) -> 
 
 
 def typed_results(page: str) -> list[str]:
-    """Numbers and first lines of tables of results that stand between no markers."""
+    """Numbers, and first lines of tables of results and of what programs printed, that stand between no markers."""
     text = documents.without_blocks(GENERATED.sub("", page))
     tables = [table.splitlines()[0] for table in TABLE.findall(text) if len(DECIMAL.findall(table)) >= MANY]
-    return FIGURE.findall(text) + tables
+    fences = [
+        fence.splitlines()[1]
+        for fence in FENCE.findall(text)
+        if re.search(r"^\$ ", fence, re.MULTILINE) or FIGURE.search(fence) or len(DECIMAL.findall(fence)) >= MANY
+    ]
+    return FIGURE.findall(FENCE.sub("", text)) + tables + fences
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -83,6 +93,21 @@ def test_what_is_measured_by_hand_names_what_prints_it(page: Path) -> None:
             assert (ROOT / program).is_file() or shutil.which(program, path=str(Path(sys.executable).parent)), command
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_results_are_of_the_shipped_policies(page: Path) -> None:
+    """Of what takes long nobody sees here whether it is still so; of which policy it was, one does."""
+    shipped = {load_policy(path).checksum[:8] for path in (ROOT / "policies").glob("*.npz")}
+    assert not documents.policies_named(GENERATED.sub("", page.read_text(encoding="utf-8"))) - shipped, (
+        "made with other policies: run scripts/docs_numbers, or what the marker says"
+    )
+
+
+def test_the_policies_that_results_name_are_found() -> None:
+    text = "friction 0.9, policy coupled f850ca447570\npolicies 2094641b, coupled e9e42593; of coupled roads"
+    assert documents.policies_named(text) == {"f850ca44", "2094641b", "e9e42593"}
+    assert not documents.policies_named("policy: mine.npz (grid coupled, 3814535d48a6), coupled deadbee")
+
+
 def test_a_typed_result_is_found() -> None:
     assert FIGURE.findall("ours saves 2.34 % here, −0.90 % there, 81.2 Wh/km, by 0.05 points") == [
         "2.34",
@@ -92,6 +117,10 @@ def test_a_typed_result_is_found() -> None:
     ]
     assert not FIGURE.findall("friction 0.9, grid 0.05 m/s, version 1.2.3")
     table = "| a | b |\n|---|---|\n| 1.5 | 2.5 |\n| 3.5 | 4.5 |\n| 5.5 | 6.5 |\n"
+    assert FIGURE.findall("0.57 of it, 7.7 a minute, 5.4 J a minute, 36 J, 1.5 of the") == ["0.57", "7.7", "5.4"]
+    assert typed_results("```\n$ replay drive\n0 of 3 differ\n```\n") == ["$ replay drive"]
+    assert typed_results("```\ncold: 8.62 ms\n```\n") == ["cold: 8.62 ms"]
+    assert typed_results("```\nreplay drive --set gain=0.5\n```\n") == []
     assert typed_results(f"A step takes 1.25 ms.\n\n{table}") == ["1.25", "| a | b |"]
     assert typed_results(f"<!-- measured: make soak -->\n0.5 ms\n{table}<!-- end -->\n") == []
 
