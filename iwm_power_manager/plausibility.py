@@ -59,6 +59,14 @@ _MOTOR = (
         _KILOWATTS,
     ),
 )
+_BRAKE = _Bound(
+    "max_torque_nm",
+    "m/s2 of this axle's friction brakes alone",
+    0.1,
+    500.0,
+    "kN m in an N m field?",
+    "N mm or a force in N?",
+)
 _BATTERY = (
     _Bound("discharge_limit_w", _LIMIT, 0.05, 100.0, _KILOWATTS, _KILOWATTS),
     _Bound("charge_limit_w", _LIMIT, 0.005, 100.0, _KILOWATTS, _KILOWATTS),
@@ -105,6 +113,9 @@ def check_car(path: Path, params: VehicleParams, key_of: Callable[[str, str], st
         losses = "efficiency_map" if axle.motor.map_loss_w.size else "loss"
         for bound, value in zip(_MOTOR, _motor_values(axle, params.chassis.mass_kg), strict=True):
             _check(path, f"{key_of(name, 'motor')}.{losses if bound.key == 'loss' else bound.key}", bound, value)
+        # A car may have no friction brakes on an axle.
+        brake_mps2 = 2.0 * axle.friction_brake.max_torque_nm / axle.wheel.radius_m / params.chassis.mass_kg
+        _check(path, f"{key_of(name, 'friction_brake')}.{_BRAKE.key}", _BRAKE, brake_mps2 or 1.0)
     for bound, value in zip(_BATTERY, _battery_values(params), strict=True):
         _check(path, f"battery.{bound.key}", bound, value)
 

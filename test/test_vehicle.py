@@ -462,6 +462,8 @@ def test_the_page_has_the_table():
         (("battery", "ohmic_resistance_ohm"), 4.15, "battery.ohmic_resistance_ohm", "milliohm in an ohm field"),
         (("battery", "capacity_ah"), 9000.0, "battery.capacity_ah", "Wh or mAh in an Ah field?"),
         (("motor", "loss", "quadratic_torque_w_per_nm2"), 68.5, "motor.loss", "losses of all motors"),
+        (("friction_brake", "max_torque_nm"), 0.9, "friction_brake.max_torque_nm", "means 0.00682 m/s2 of this axle's"),
+        (("friction_brake", "max_torque_nm"), 9e4, "friction_brake.max_torque_nm", "N mm or a force in N?"),
     ],
 )
 def test_numbers_that_do_not_fit_each_other_are_refused_with_the_likely_unit(path, value, key, words, refused):

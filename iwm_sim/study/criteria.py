@@ -14,7 +14,7 @@ import numpy as np
 
 from iwm_sim.study.labels import BOUND, ED, GRDP, INSTANTANEOUS, INSTANTANEOUS_SLIP, OURS
 from iwm_sim.study.rows import Place, Row, by_place
-from iwm_sim.study.skid import Stopped
+from iwm_sim.study.skid import DEMAND_G, Stopped
 
 Cell = Mapping[str, Row]
 Cells = Mapping[Place, Cell]
@@ -179,7 +179,8 @@ def _skid(rows: Sequence[Row], stops: Sequence[Stopped]) -> list[Criterion]:
             slid.longest_locked_s <= LONGEST_LOCKED_S + 1e-9,
         ),
         Criterion(
-            f"stops from 25 m/s within {STOP_LONGER_PERCENT:g} % of the best constant-slip braking",
+            f"stops from 25 m/s, asked for {DEMAND_G:g} g, within {STOP_LONGER_PERCENT:g} % of the best "
+            "constant-slip braking",
             f"{latest.longer_percent:+.1f} % at worst",
             f"friction {latest.friction:g}, {latest.strategy}",
             latest.longer_percent <= STOP_LONGER_PERCENT and all(stop.stopped for stop in limited),

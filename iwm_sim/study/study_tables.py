@@ -25,7 +25,7 @@ from iwm_sim.study.labels import (
 )
 from iwm_sim.study.report import Column, Verdict
 from iwm_sim.study.rows import Place, Row, by_place, most_saved
-from iwm_sim.study.skid import Stopped
+from iwm_sim.study.skid import DEMAND_G, Stopped
 
 Cell = dict[str, Row]
 
@@ -354,7 +354,8 @@ def stops_table(study: Study) -> TableOf:
         "",
         columns,
         study.stops,
-        "Best possible: every wheel held at the one slip that stops shortest, from the equations of motion alone.",
+        f"Asked for: {DEMAND_G:g} g throughout, more than any of these roads gives. Best possible: every wheel held "
+        "at the one slip that stops shortest, from the equations of motion alone.",
     )
 
 
