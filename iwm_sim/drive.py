@@ -357,7 +357,7 @@ def save_run(path: Path | str, run: Run, notes: Mapping[str, Any] | None = None)
         dt_s=np.float64(run.dt_s),
         series=run.series,
         road=np.zeros((0, 0)) if run.road is None else run.road,
-        final=np.array(_leaves(run.final)),
+        final=np.array(json.dumps(run.final)),
         notes=np.array(json.dumps(dict(notes or {}))),
     )
     atomic_write(path, buffer.getvalue())
@@ -369,27 +369,11 @@ def load_run(path: Path | str) -> tuple[Run, dict[str, Any]]:
     try:
         if tuple(content["columns"]) != COLUMNS:
             raise ConfigError(path, "columns", "are those of another version", ", ".join(COLUMNS))
-        leaves = iter(content["final"].tolist())
+        final: list[Any] = [tuple(v) if isinstance(v, list) else v for v in json.loads(str(content["final"]))]
+        car = plant.PlantState(*final)
+        car = car._replace(energies=plant.Energies(*car.energies))
         road = content["road"] if content["road"].size else None
-        run = Run(float(content["dt_s"]), content["series"], _rebuild(plant.PlantState, leaves), road)
+        run = Run(float(content["dt_s"]), content["series"], car, road)
         return run, json.loads(str(content["notes"]))
-    except (KeyError, TypeError, ValueError, StopIteration, RecursionError):
+    except (KeyError, TypeError, ValueError, RecursionError):
         raise ConfigError(path, "", "is no recorded run") from None
-
-
-def _leaves(value: Any) -> list[float]:
-    if isinstance(value, tuple):
-        return [leaf for part in value for leaf in _leaves(part)]
-    return [float(value)]
-
-
-def _rebuild(kind: type[plant.PlantState], leaves: Any) -> plant.PlantState:
-    fields: dict[str, Any] = {}
-    for name in kind._fields:
-        if name == "energies":
-            fields[name] = plant.Energies(*(next(leaves) for _ in plant.Energies._fields))
-        elif name in plant.OF_WHEELS:
-            fields[name] = tuple(next(leaves) for _ in range(4))
-        else:
-            fields[name] = next(leaves)
-    return kind(**fields)

@@ -111,9 +111,6 @@ class PlantState(NamedTuple):
 #: Below this speed, m/s, a motor gives its torque either way: no regeneration is worth anything there.
 STANDSTILL_MPS = 0.1
 
-#: Fields of a `PlantState` that hold a number for each wheel.
-OF_WHEELS = ("wheel_speed_radps", "heat", "motor_torque_nm", "friction_torque_nm")
-
 
 def initial_plant(vehicle: VehicleParams, soc: float = 0.8, speed_mps: float = 0.0) -> PlantState:
     """A rested, cold car at a speed, its wheels rolling."""

@@ -213,10 +213,10 @@ def fitted_rule(
 
 
 @_styled
-def axle_powers(time_s: ArrayLike, runs: Sequence[AxleRun], window_s: tuple[float, float]) -> Figure:
-    """Fig. 14: front and rear power of strategies inside a window of time, s."""
+def axle_powers(time_s: ArrayLike, runs: Sequence[AxleRun]) -> Figure:
+    """Fig. 14: front and rear power of strategies."""
     in_kw = [AxleRun(run.label, np.asarray(run.front) / 1000.0, np.asarray(run.rear) / 1000.0) for run in runs]
-    figure, axes = _by_axle(time_s, in_kw, window_s, 4.6, COLOURS[:6], 1.3)
+    figure, axes = _by_axle(time_s, in_kw, 4.6, COLOURS[:6], 1.3)
     axes[0].set_ylabel("Front power, kW")
     axes[1].set_ylabel("Rear power, kW")
     axes[0].legend(ncols=len(runs))
@@ -224,11 +224,9 @@ def axle_powers(time_s: ArrayLike, runs: Sequence[AxleRun], window_s: tuple[floa
 
 
 @_styled
-def slips(
-    time_s: ArrayLike, runs: Sequence[AxleRun], critical_slip: float, window_s: tuple[float, float] | None = None
-) -> Figure:
+def slips(time_s: ArrayLike, runs: Sequence[AxleRun], critical_slip: float) -> Figure:
     """Fig. 15: slip of the front (a) and rear (b) axle, with the critical slip marked on both sides."""
-    figure, axes = _by_axle(time_s, runs, window_s, 4.8, (VERMILION, BLUE, GREEN), 1.2)
+    figure, axes = _by_axle(time_s, runs, 4.8, (VERMILION, BLUE, GREEN), 1.2)
     for axis, label in zip(axes, ("(a) Front slip", "(b) Rear slip"), strict=True):
         for level in (-critical_slip, critical_slip):
             axis.axhline(level, color=GREY, linestyle=":", linewidth=1.0)
@@ -238,22 +236,14 @@ def slips(
 
 
 def _by_axle(
-    time_s: ArrayLike,
-    runs: Sequence[AxleRun],
-    window_s: tuple[float, float] | None,
-    height_in: float,
-    colours: Sequence[str],
-    width: float,
+    time_s: ArrayLike, runs: Sequence[AxleRun], height_in: float, colours: Sequence[str], width: float
 ) -> tuple[Figure, list[Axes]]:
     """Front above rear, a line for each run."""
     figure, axes = _axes(2, height_in=height_in)
-    inside = _inside(time_s, window_s)
-    time = np.asarray(time_s, dtype=np.float64)[inside]
     for index, run in enumerate(runs):
         for axis, values in zip(axes, (run.front, run.rear), strict=True):
-            shown = np.asarray(values, dtype=np.float64)[inside]
-            axis.plot(time, shown, color=colours[index % len(colours)], linewidth=width, label=run.label)
-    _time_axis(axes[1], time)
+            axis.plot(time_s, values, color=colours[index % len(colours)], linewidth=width, label=run.label)
+    _time_axis(axes[1], time_s)
     return figure, axes
 
 
@@ -301,13 +291,3 @@ def _time_axis(axis: Axes, time_s: ArrayLike) -> None:
     axis.set_xlabel("Time, s")
     time = np.asarray(time_s, dtype=np.float64)
     axis.set_xlim(float(time.min()), float(time.max()))
-
-
-def _inside(time_s: ArrayLike, window_s: tuple[float, float] | None) -> np.ndarray:
-    time = np.asarray(time_s, dtype=np.float64)
-    if window_s is None:
-        return np.ones(len(time), dtype=bool)
-    inside = (time >= window_s[0]) & (time <= window_s[1])
-    if not inside.any():
-        raise ValueError(f"no sample between {window_s[0]} s and {window_s[1]} s")
-    return np.asarray(inside)

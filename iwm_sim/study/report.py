@@ -188,27 +188,8 @@ class Chart:
             lines = []
             for series in panel.series:
                 thin_time, values = thin(time, np.asarray(series.values, dtype=np.float64), CHART_POINTS)
-                lines.append(
-                    {
-                        "name": series.name,
-                        "colour": series.colour,
-                        "dashed": series.dashed,
-                        "step": series.step,
-                        "wide": series.wide,
-                        "values": _compact(values),
-                    }
-                )
-            panels.append(
-                {
-                    "label": panel.label,
-                    "unit": panel.unit,
-                    "decimals": panel.decimals,
-                    "range": panel.limits,
-                    "ticks": list(panel.ticks) or None,
-                    "references": list(panel.references),
-                    "series": lines,
-                }
-            )
+                lines.append(vars(series) | {"values": _compact(values)})
+            panels.append(vars(panel) | {"series": lines})
         content = {"time": _compact(thin_time, 8), "panels": panels}
         return json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
 

@@ -171,7 +171,6 @@ def window_figures(window: dict[str, dict[str, FloatArray]]) -> list[Drawn]:
     """Figures 14 and 15."""
     ed, ours, without = window[ED], window[OURS], window[GATE_OFF]
     time_s = ed["time_s"]
-    span = (float(time_s[0]), float(time_s[-1]))
     powers = [
         figures.AxleRun(name, run["front_power_w"], run["rear_power_w"]) for name, run in (("ED", ed), ("ours", ours))
     ]
@@ -184,14 +183,14 @@ def window_figures(window: dict[str, dict[str, FloatArray]]) -> list[Drawn]:
             "figure_14_powers",
             "Figure 14: powers of the axles",
             f"UDDS, {_DRIVEN}; ours decides every 0.02 s.",
-            figures.axle_powers(time_s, powers, span),
+            figures.axle_powers(time_s, powers),
             TABLE_6,
         ),
         Drawn(
             "figure_15_slips",
             "Figure 15: slips with and without skid avoidance",
             f"UDDS, {_DRIVEN}: the paper's SDP without skid avoidance, decided every 0.1 s, and ours, every 0.02 s.",
-            figures.slips(time_s, slips, CRITICAL_SLIP, span),
+            figures.slips(time_s, slips, CRITICAL_SLIP),
             TABLE_6,
         ),
     ]

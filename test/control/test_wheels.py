@@ -12,9 +12,11 @@ from iwm_power_manager.control.settings import GATE_MODE_OFF, default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import (
     LIMIT_FRICTION_BRAKE,
+    LIMIT_MOTOR,
     LIMIT_REGENERATION,
     LIMIT_SLEW,
     LIMIT_SLIP,
+    LIMIT_THERMAL,
     ControllerState,
     Measurement,
     initial_state,
@@ -498,3 +500,86 @@ def test_five_speeds_that_agree_are_right_also_where_front_and_rear_wheels_diffe
         command, state = step(measured(0.0, rolling(speed), speed=speed), state, OFF)
     assert command.doubted == 0
     assert command.speed_mps == pytest.approx(speed, abs=0.2)
+
+
+@WHEELS
+@pytest.mark.parametrize("part", [0.97, 1.03])
+def test_wheels_that_turn_end_the_hold_by_the_rim_of_the_front_wheels(wheel, part):
+    """Held on a slope, while the speed sensor shows nothing yet: of the four it is the mean, whichever turns."""
+    wheels = one(wheel, 4.0 * part * law.MOVING_MPS / CAR.front.wheel.radius_m, (0.0,) * 4)
+    state = remembered(0.0, speed_radps=wheels)._replace(hold_nm=100.0)
+    command, _ = step(measured(0.0, wheels, speed=0.0), state, OFF)
+    assert command.hold_nm == (0.0 if part > 1.0 else 100.0)
+
+
+@WHEELS
+@pytest.mark.parametrize("error", [-3.0, 3.0])
+def test_a_run_without_a_sensor_starts_with_the_mean_of_the_two_middle_rims(wheel, error):
+    rims = [14.9, 15.1, 14.9, 15.1]
+    rims[wheel] = SPEED + error
+    wheels = tuple(rim / radius for rim, radius in zip(rims, RADII, strict=True))
+    command, _ = step(measured(0.0, wheels, speed=float("nan")), None, OFF)
+    assert command.speed_mps == pytest.approx(sum(sorted(rims)[1:3]) / 2.0, abs=0.02)
+
+
+@WHEELS
+@pytest.mark.parametrize("demand", [-1e3, 0.0, 1e3])
+def test_a_wheel_that_is_not_believed_does_not_lead_the_speed(wheel, demand):
+    """Without a sensor, three wheels lead it; the fourth shows a fifth less, or more."""
+    for part in (0.8, 1.2):
+        wheels = one(wheel, part * SPEED / RADII[wheel], rolling())
+        start = remembered(speed_radps=wheels)
+        doubts = one(wheel, 0.5, (0.0,) * 4)
+        state = start._replace(motion=start.motion._replace(wheel_doubt_s=doubts, shown_mps=float("nan")))
+        for _ in range(20):
+            command, state = step(measured(demand, wheels, speed=float("nan")), state, OFF)
+            state = state._replace(wheels=start.wheels)
+        assert command.doubted == 16 | 1 << wheel
+        assert command.speed_mps == pytest.approx(SPEED, abs=0.05)
+
+
+@AXLES
+def test_an_axle_of_which_no_wheel_is_believed_is_taken_as_rolling_on_its_own_wheels(axle):
+    doubts = (0.5, 0.5, 0.0, 0.0) if axle == "front" else (0.0, 0.0, 0.5, 0.5)
+    wheels = tuple(0.5 * w if doubt else w for w, doubt in zip(rolling(), doubts, strict=True))
+    start = remembered(speed_radps=wheels)
+    command, _ = step(measured(0.0, wheels), start._replace(motion=start.motion._replace(wheel_doubt_s=doubts)), OFF)
+    assert command.doubted == (3 if axle == "front" else 12)
+    # What an axle's wheels do is told by its slip: none, though they seem to stand half still.
+    assert (command.front_slip, command.rear_slip) == (pytest.approx(0.0, abs=1e-6), pytest.approx(0.0, abs=1e-6))
+
+
+@WHEELS
+def test_a_torque_moves_the_car_by_the_radius_of_its_own_wheel(wheel):
+    """Without sensor and wheels that are believed, the torque of one wheel is all that the speed follows."""
+    start = remembered()
+    nobody = start.motion._replace(wheel_doubt_s=(0.5,) * 4, shown_mps=float("nan"), doubt_s=0.5)
+
+    def speed(torque_nm):
+        wheels = tuple(w._replace(total_nm=torque_nm if i == wheel else 0.0) for i, w in enumerate(start.wheels))
+        _, after = step(measured(0.0, speed=float("nan")), start._replace(wheels=wheels, motion=nobody), OFF)
+        return after.motion.speed_mps
+
+    gained = speed(200.0) - speed(0.0)
+    assert gained == pytest.approx(0.01 * 200.0 / RADII[wheel] / CAR.chassis.mass_kg, rel=1e-3)
+
+
+@AXLES
+def test_an_axle_that_has_all_it_was_asked_for_says_nothing_of_its_warm_motors(axle):
+    """The other one is too weak for its half, and says that it is its motors."""
+    heats = tuple(0.5 if (i < 2) == (axle == "rear") else 0.0 for i in range(4))
+    weak = changed(axle, "motor", peak_torque_nm=20.0, continuous_torque_nm=20.0)
+    command, _ = law.step(measured(5e3), remembered(heat=heats, motor_nm=(20.0,) * 4), OFF, weak, TABLE)
+    assert command.limits & (LIMIT_MOTOR | LIMIT_THERMAL) == LIMIT_MOTOR
+
+
+@pytest.mark.parametrize("share", [0.2, 0.8])
+def test_axles_that_have_all_they_were_asked_for_say_nothing_however_uneven_that_is(share):
+    tuned = OFF._replace(strategy=default_settings("rule").strategy)
+    table = empty_table(rule=(0.0, share, 0.0, share))
+    state = remembered(heat=(0.5,) * 4)
+    for _ in range(3):
+        command, state = law.step(measured(3e3), state, tuned, CAR, table)
+        state = state._replace(wheels=remembered(heat=(0.5,) * 4).wheels)
+    assert (command.front_share - 0.5) * (share - 0.5) > 0.0
+    assert command.limits & (LIMIT_MOTOR | LIMIT_THERMAL) == 0

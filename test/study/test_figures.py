@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from iwm_sim.study import figures as f
+from iwm_sim.study.cases import Case, Result
+from iwm_sim.study.study_figures import WINDOW_S, window_of
 from study_fixtures import CHAIN
 
 TIME = np.arange(0.0, 100.0, 0.5)
@@ -21,7 +23,7 @@ def built():
         "fig10": f.depletion_over_split_panels([("(a) 1 kW", [BOWL]), ("(b) 5 kW", [BOWL])]),
         "fig12": f.policy_convergence([300.0, 20.0, 0.0], [1.0, 1e-3, 1e-9]),
         "fig13": f.fitted_rule(1e3 * WAVE, 600.0 * WAVE, [-1e3, 1e3], [-600.0, 600.0]),
-        "fig14": f.axle_powers(TIME, [f.AxleRun("sdp", 1e3 * WAVE, 2e3 * WAVE)], (20.0, 40.0)),
+        "fig14": f.axle_powers(TIME, [f.AxleRun("sdp", 1e3 * WAVE, 2e3 * WAVE)]),
         "fig15": f.slips(TIME, [f.AxleRun("with", WAVE, WAVE), f.AxleRun("without", WAVE, WAVE)], 0.2),
         "transitions": f.transition_matrix(CHAIN),
         "frontier": f.switching_frontier({"ours": ([4.0, 6.0], [2.3, 2.45]), "preview": ([0.0, 7.0], [0.0, 2.47])}),
@@ -72,17 +74,21 @@ def test_the_ends_where_an_axle_rests_are_rings_and_no_part_of_the_line():
     assert list(rings.get_xdata()) == list(dots.get_xdata()) == [0.0, 1.0]
 
 
-def test_powers_are_drawn_in_kilowatts_inside_the_window(figures):
-    front = figures["fig14"].axes[0].lines[0]
-    assert front.get_xdata().min() == 20.0
-    assert front.get_xdata().max() == 40.0
-    inside = (TIME >= 20.0) & (TIME <= 40.0)
-    np.testing.assert_allclose(front.get_ydata(), WAVE[inside])
+def test_powers_are_drawn_in_kilowatts(figures):
+    front, rear = (axis.lines[0] for axis in figures["fig14"].axes)
+    assert list(front.get_xdata()) == list(TIME)
+    np.testing.assert_allclose(front.get_ydata(), WAVE)
+    np.testing.assert_allclose(rear.get_ydata(), 2.0 * WAVE)
 
 
-def test_a_window_outside_the_drive_is_refused():
-    with pytest.raises(ValueError, match="no sample between"):
-        f.axle_powers(TIME, [f.AxleRun("sdp", WAVE, WAVE)], (500.0, 600.0))
+def test_the_watched_runs_are_cut_to_the_window_or_shown_whole_where_they_end_before_it():
+    def seen(time_s):
+        case = Case("nycc", "jalalmaab_2015", "none", 0.9, "equal", keep=("time_s",))
+        return window_of([Result(case, None, {"time_s": time_s}), Result(case, None, {})])["equal"]["time_s"]
+
+    first, last = WINDOW_S
+    assert list(seen(np.array([0.0, first, last, last + 1.0]))) == [first, last]
+    assert list(seen(TIME)) == list(TIME)
 
 
 def test_the_last_policy_iteration_may_change_nothing(figures):

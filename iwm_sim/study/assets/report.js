@@ -76,7 +76,7 @@
       }
     }
     if (low > high) { low = 0; high = 1; }
-    if (panel.range) { low = Math.min(low, panel.range[0]); high = Math.max(high, panel.range[1]); }
+    if (panel.limits) { low = Math.min(low, panel.limits[0]); high = Math.max(high, panel.limits[1]); }
     if (low === high) { const pad = Math.abs(low) * 0.05 || 1; low -= pad; high += pad; }
     const margin = 0.06 * (high - low);
     return [low - margin, high + margin];
@@ -130,11 +130,11 @@
           node(plot, "line", { class: "gridline", x1: x(t), x2: x(t), y1: TOP, y2: bottom });
           if (last) node(plot, "text", { class: "tick", x: x(t), y: bottom + 15, "text-anchor": "middle" }, format(t, xTicks.decimals));
         }
-        const yTicks = panel.ticks ? { values: panel.ticks.map((t) => t[0]) } : ticks(low, high, 5);
+        const yTicks = panel.ticks.length ? { values: panel.ticks.map((t) => t[0]) } : ticks(low, high, 5);
         yTicks.values.forEach((value, k) => {
           if (value < low || value > high) return;
           node(plot, "line", { class: value === 0 ? "zero" : "gridline", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value) });
-          node(plot, "text", { class: "tick", x: LEFT - 7, y: y(value) + 4, "text-anchor": "end" }, panel.ticks ? panel.ticks[k][1] : format(value, yTicks.decimals));
+          node(plot, "text", { class: "tick", x: LEFT - 7, y: y(value) + 4, "text-anchor": "end" }, panel.ticks.length ? panel.ticks[k][1] : format(value, yTicks.decimals));
         });
         const lines = node(plot, "g", { "clip-path": `url(#${clip})` });
         for (const series of panel.series) {
@@ -161,7 +161,7 @@
         if (inside) { cursor.setAttribute("x1", x(time[k])); cursor.setAttribute("x2", x(time[k])); }
         panel.series.forEach((series, s) => {
           const value = inside ? series.values[k] : null;
-          const named = panel.ticks && value !== null ? panel.ticks.find((t) => t[0] === value) : null;
+          const named = panel.ticks.find((t) => t[0] === value);
           now[s].textContent = value === null ? "" : named ? named[1] : format(value, panel.decimals);
         });
       }
