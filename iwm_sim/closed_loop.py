@@ -7,6 +7,7 @@ same numbers give the same bits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -140,6 +141,7 @@ class RoadRow(NamedTuple):
     road_rr: float
     mode: float
     wheels_lost: float
+    doubted: float
 
 
 ROAD_COLUMNS = RoadRow._fields
@@ -279,6 +281,7 @@ def measure(
         (1.0, 1.0, 1.0, 1.0),
         1.0,
         (0.0, 0.0, 0.0, 0.0),
+        math.nan,
     )
 
 

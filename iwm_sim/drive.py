@@ -34,6 +34,8 @@ from iwm_sim.steering import LaneKeeper
 #: Columns of a run's series that only the control law knows; a drive leaves them empty (NaN).
 LAW_COLUMNS = Decision._fields
 CAR_COLUMNS = tuple(name for name in COLUMNS if name not in LAW_COLUMNS)
+#: Front axle's part of what brakes of another system do.
+FOREIGN_FRONT = 0.7
 #: Nothing is known of what the law thought.
 UNDECIDED = Decision(*(math.nan for _ in LAW_COLUMNS))
 
@@ -204,13 +206,14 @@ class Drive:
         decision: Decision = UNDECIDED,
         mode: float = math.nan,
         wheels_lost: float = math.nan,
+        doubted: float = math.nan,
     ) -> None:
         """Hold a command for one step.
 
         Parameters
         ----------
         motor_torque_nm, friction_torque_nm : what is commanded; actuators that fail do something else
-        decision, mode, wheels_lost : for the series, what the power manager says of itself
+        decision, mode, wheels_lost, doubted : for the series, what the power manager says of itself
         """
         pedals = self._look()
         before = self.car
@@ -222,7 +225,7 @@ class Drive:
         self.car = car = plant.advance(
             before,
             self._faults.motors(motor_torque_nm, time_s),
-            self._faults.brakes(friction_torque_nm, time_s),
+            self._faults.brakes(self._foreign_nm() if self.scenario.foreign_brakes else friction_torque_nm, time_s),
             steering / self._params.chassis.steering_ratio,
             plant.Surroundings(road, grade, self.scenario.headwind_mps),
             self._dt_s,
@@ -231,7 +234,7 @@ class Drive:
         )
         trace_mps = math.nan if self._trace is None else float(self._trace.speed_mps[k])
         self._series[k] = row_of(k * self._dt_s, trace_mps, pedals, decision, before, car, self._params)
-        self._road_series[k] = _road_row(before, car, steering, grade, road, mode, wheels_lost, self._params)
+        self._road_series[k] = _road_row(before, car, steering, grade, road, mode, wheels_lost, doubted, self._params)
         self.step += 1
         self._pedals = None
 
@@ -242,6 +245,13 @@ class Drive:
         force_n = self._look().brake * full_braking_w(speed, self._params) / max(speed, floor)
         front = -force_n * self._params.front.wheel.radius_m / 4.0
         rear = -force_n * self._params.rear.wheel.radius_m / 4.0
+        return front, front, rear, rear
+
+    def _foreign_nm(self) -> Wheels:
+        """Friction torque of each wheel by the brakes of another system, most of it in front as in most cars."""
+        force_n = self._at(self.scenario.foreign_brakes, self.time_s) * self._believed.chassis.mass_kg
+        front = -0.5 * FOREIGN_FRONT * force_n * self._believed.front.wheel.radius_m
+        rear = -0.5 * (1.0 - FOREIGN_FRONT) * force_n * self._believed.rear.wheel.radius_m
         return front, front, rear, rear
 
     def run(self) -> Run:
@@ -318,6 +328,7 @@ def _road_row(
     road: Wheels,
     mode: float,
     wheels_lost: float,
+    doubted: float,
     vehicle: VehicleParams,
 ) -> RoadRow:
     """The row of a step from the car before and after it."""
@@ -345,6 +356,7 @@ def _road_row(
         **{f"road_{n}": x for n, x in zip(names, road, strict=True)},
         mode=mode,
         wheels_lost=wheels_lost,
+        doubted=doubted,
     )
 
 

@@ -277,6 +277,11 @@ def wheels_lost_s(d: Driven) -> float:
     return float(np.count_nonzero(d["wheels_lost"] > 0.0) * d.run.dt_s)
 
 
+def doubted_s(d: Driven) -> float:
+    """Time that the law does not believe some sensor."""
+    return float(np.count_nonzero(d["doubted"] > 0.0) * d.run.dt_s)
+
+
 def degraded_s(d: Driven) -> float:
     """Time that the power manager is not in its normal mode."""
     known = d["mode"][np.isfinite(d["mode"])]
@@ -307,6 +312,7 @@ MEASURES: dict[str, Callable[[Driven], float]] = {
         distance_m,
         final_speed_mps,
         wheels_lost_s,
+        doubted_s,
         degraded_s,
     )
 }

@@ -68,6 +68,8 @@ def controller_of(scenario: Scenario, settings: Settings | None = None, policies
     """The power manager as the node starts it, for the scenario's car, with the friction it is told as its prior."""
     vehicle: Vehicle = scenario.vehicle
     params = vehicle.params
+    if scenario.foreign_brakes:
+        params = params.with_axles(friction_brake=params.front.friction_brake._replace(max_torque_nm=0.0))
     thresholds = Thresholds()
     prior = scenario.told_friction
     settings = (settings or default_settings())._replace(friction_prior=prior)
@@ -87,6 +89,8 @@ def give(controller: Controller, sensors: Sensors, drive: Drive, now_ns: int) ->
     """Hand the power manager everything that arrives in this step."""
     monitor = controller.monitor
     monitor.direction = float(sensors.direction)
+    if drive.scenario.imu:
+        monitor.take_acceleration(sensors.acceleration_mps2, now_ns)
     if not drive.lost("vehicle_speed") and not math.isnan(sensors.speed_mps):
         monitor.take_speed(SpeedReading(now_ns, sensors.speed_mps), now_ns)
     if not drive.lost("wheel_states"):
@@ -145,6 +149,7 @@ def drive_scenario(
             decision_of(command),
             float(manager.supervision.mode),
             float(manager.wheels_lost),
+            float(command.doubted),
         )
         now_ns += period_ns
     return drive.run()

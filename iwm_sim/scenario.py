@@ -17,6 +17,9 @@
       headwind_mps: 0.0
     told_friction: 0.9                        # what the power manager is told; optional: the road's at its start
     until: {time_s: 30.0, standstill: true}   # the end; standstill needs a time as well
+    foreign_brakes:                           # of another system; the power manager has no friction brakes then
+      - {from_s: 2.0, braking_mps2: 6.0}
+    imu: false                                # whether the power manager hears the accelerometer
     faults:
       - {sensor: vehicle_speed, factor: 1.2, from_s: 2.0, until_s: 4.0}
       - {actuator: motor_front_left, dead: true, from_s: 2.0}
@@ -63,6 +66,8 @@ _KEYS = (
     "direction",
     "told_friction",
     "until",
+    "foreign_brakes",
+    "imu",
     "faults",
     "require",
     "aim",
@@ -114,6 +119,8 @@ class Scenario:
     ----------
     truth : the car as it is, load included; `vehicle` is what power manager and driver believe in
     steering : (from_s, angle of the steering wheel in rad); None for the driver who keeps the lane
+    foreign_brakes : (from_s, deceleration in m/s2) of another system, which has the friction brakes
+    imu : the power manager hears the accelerometer
     """
 
     name: str
@@ -131,6 +138,8 @@ class Scenario:
     speed_mps: float = 0.0
     soc: float = 0.8
     to_standstill: bool = False
+    foreign_brakes: tuple[tuple[float, float], ...] = ()
+    imu: bool = False
     faults: tuple[Fault, ...] = ()
     require: tuple[Bound, ...] = ()
     about: str = ""
@@ -204,6 +213,8 @@ def load_scenario(name: Path | str, idle_drive: str | None = None, vehicle: Vehi
         speed_mps=files.check_number(path, "start.speed_mps", start.get("speed_mps", first), -20.0, 70.0, unit="m/s"),
         soc=files.check_number(path, "start.soc", start.get("soc", 0.8), 0.0, 1.0),
         to_standstill=to_standstill,
+        foreign_brakes=_foreign(path, content.get("foreign_brakes", [])),
+        imu=files.check_bool(path, "imu", content.get("imu", False)),
         faults=_faults(path, content.get("faults", [])),
         require=(*_bounds(path, content, "require"), *_bounds(path, content, "aim")),
         about=" ".join(about.split()),
@@ -283,6 +294,15 @@ def _steering(path: Path, content: Any, ratio: float) -> tuple[tuple[float, floa
         files.check_keys(path, entry, ("from_s", "wheel_deg"), (), where)
         angle = files.check_number(path, f"{where}.wheel_deg", entry["wheel_deg"], -most, most, unit="deg")
         result.append((float(entry["from_s"]), math.radians(angle)))
+    return tuple(result)
+
+
+def _foreign(path: Path, content: Any) -> tuple[tuple[float, float], ...]:
+    result = []
+    for where, entry in _listed(path, "foreign_brakes", content, "from_s", 0.0) if content != [] else ():
+        files.check_keys(path, entry, ("from_s", "braking_mps2"), (), where)
+        braking = files.check_number(path, f"{where}.braking_mps2", entry["braking_mps2"], 0.0, 20.0, unit="m/s2")
+        result.append((float(entry["from_s"]), braking))
     return tuple(result)
 
 

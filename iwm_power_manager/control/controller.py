@@ -30,7 +30,7 @@ from iwm_power_manager.control.supervision import (
     supervise,
 )
 from iwm_power_manager.control.table import PolicyTable
-from iwm_power_manager.control.types import Command, Measurement, initial_state
+from iwm_power_manager.control.types import Command, Measurement, Wheels, initial_state
 from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.model.parameters import VehicleParams
 
@@ -140,7 +140,7 @@ class Controller:
             self.supervision = supervise(self.supervision, stale, passed_s, self._limits.supervision)
         self._watch_motors(dt_s)
         self._follow_estimate()
-        measurement = self._measurement(dt_s)
+        measurement = self._measurement(now_ns, dt_s)
         settings = self._settings()
         command, after = law.step(measurement, self.state, settings, self._vehicle, self.policy)
         problem = violated_bound(command, self._vehicle)
@@ -170,7 +170,12 @@ class Controller:
             self.actuators = judge(self.actuators, reported, self._unreported_s, self._limits.actuators)
             self._unreported_s = 0.0
 
-    def _measurement(self, dt_s: float) -> Measurement:
+    @property
+    def brake_gain(self) -> Wheels:
+        """Part of its friction torque that each brake seems to give."""
+        return self.state.motion.brake_gain
+
+    def _measurement(self, now_ns: int, dt_s: float) -> Measurement:
         monitor, supervision = self.monitor, self.supervision
         speed = monitor.speed_mps
         wheels = monitor.wheel_speed_radps
@@ -195,6 +200,7 @@ class Controller:
             motor_gain=self.actuators.gains,
             direction=monitor.direction,
             motor_stuck_nm=self.actuators.stuck_nm,
+            acceleration_mps2=monitor.acceleration_mps2(now_ns),
         )
 
     def _settings(self) -> Settings:

@@ -634,12 +634,14 @@ def _commanded(
     motor = (scale * wanted[0], scale * wanted[1], scale * wanted[2], scale * wanted[3])
     delivered = _delivered_nm(motor, measurement.motor_gain, measurement.motor_stuck_nm)
     friction = _frictions_nm(f, r, delivered, braking, vehicle)
-    fl_nm, fr_nm = delivered[0] + friction[0], delivered[1] + friction[1]
-    rl_nm, rr_nm = delivered[2] + friction[2], delivered[3] + friction[3]
+    brakes = state.motion.brake_gain
+    fl_nm, fr_nm = delivered[0] + brakes[0] * friction[0], delivered[1] + brakes[1] * friction[1]
+    rl_nm, rr_nm = delivered[2] + brakes[2] * friction[2], delivered[3] + brakes[3] * friction[3]
     gate = (1 if front_gated else 0) + (2 if rear_gated else 0)
     command = Command(
         motor_torque_nm=motor,
         friction_torque_nm=friction,
+        brake_gain=brakes,
         front_share=memory.applied_share,
         decided_share=memory.decided_share,
         gate=gate,
@@ -777,6 +779,7 @@ def _believed(measurement: Measurement, motion: Motion, travel: float, settings:
         m.motor_gain,
         m.direction,
         (travel * stuck[0], travel * stuck[1], travel * stuck[2], travel * stuck[3]),
+        m.acceleration_mps2,
     )
 
 
@@ -789,6 +792,7 @@ def _answered(
     return Command(
         motor_torque_nm=(travel * motor[0], travel * motor[1], travel * motor[2], travel * motor[3]),
         friction_torque_nm=friction_nm,
+        brake_gain=made.brake_gain,
         front_share=made.front_share,
         decided_share=made.decided_share,
         gate=made.gate,

@@ -36,6 +36,9 @@ BATTERY = "battery_state"
 FRICTION = "road_friction"
 
 _NS_PER_S = 1e9
+#: An accelerometer that shows more, m/s2, or is silent for longer, s, says nothing.
+_MOST_MPS2 = 30.0
+_ACCELERATION_OLDEST_S = 0.1
 #: Refused for what was accepted before, not for what they are.
 _REFUSED_BY_ANOTHER = (Violation.TOO_FAST, Violation.STAMP_NOT_NEWER)
 #: Speeds that agree differ by no more than this, and this part of the largest.
@@ -185,6 +188,7 @@ class InputMonitor:
         self.friction = math.nan
         self.verdicts = (WheelVerdict.GOOD,) * 4
         self.motor_torque_nm: Wheels | None = None
+        self._acceleration = (math.nan, 0)
         self._wheel_memory = NEW_WHEELS
         self.forget_times()
 
@@ -275,6 +279,16 @@ class InputMonitor:
         """The latest report of the motors' torques, once; None if none has come since."""
         reported, self.motor_torque_nm = self.motor_torque_nm, None
         return reported
+
+    def take_acceleration(self, acceleration_mps2: float, now_ns: int) -> None:
+        """Keep what an accelerometer shows, forward."""
+        if abs(acceleration_mps2) <= _MOST_MPS2:
+            self._acceleration = (acceleration_mps2, now_ns)
+
+    def acceleration_mps2(self, now_ns: int) -> float:
+        """Acceleration as an accelerometer shows it; NaN where there is none, or it has been silent for long."""
+        value, heard_ns = self._acceleration
+        return value if now_ns - heard_ns <= _ACCELERATION_OLDEST_S * _NS_PER_S else math.nan
 
     def take_demand(self, demand_w: float, delay_s: float, now_ns: int, lag_s: float = 0.0) -> bool:
         """Judge `power_demand`, received `delay_s` after it was sent; True if it was accepted.

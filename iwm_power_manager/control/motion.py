@@ -7,8 +7,12 @@ it follows the forces, and each sensor may pull at it only as fast as a slope or
 leaves it, stands still while it moves, or contradicts four wheels that roll freely, is not believed until it has been
 near it again for a while. A believed speed sensor is taken as it is: on a healthy car this page changes nothing.
 
-The forces may be wrong too: a car on a dynamometer or a trailer, a gap in the messages. Five speeds that agree with
-each other where no slip can explain what they show are right, and the reference starts over from them.
+The forces may be wrong too: a brake that gives nothing, brakes of another system, a dynamometer, a trailer, a
+gap in the messages. A speed sensor and the wheels that roll with it are right where no slip can explain what they show,
+and the others slip as their torques make them; the reference starts over from them. What the forces said too much is
+then taken off the brakes of the wheels that cannot have had their torque, since they hardly slip; what is left is an
+acceleration that nothing explains, until the same vote says otherwise. An accelerometer, where there is one, tells at
+once whether the forces or the speeds are right.
 
 A wheel is not believed when it does what no torque can: slows down faster than its brake can, or stays away from the
 car's speed although nothing holds it. A wheel that skids does neither.
@@ -19,10 +23,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from iwm_power_manager.control.types import Measurement, MotionState, Wheels, WheelState
+from iwm_power_manager.control.types import Agreed, FourWheels, Measurement, MotionState, Wheels, WheelState
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
-from iwm_power_manager.model.parameters import VehicleParams, Wheel
+from iwm_power_manager.model.parameters import Axle, VehicleParams, Wheel
+from iwm_power_manager.model.tyre import friction_coefficient
 
 #: What a speed sensor may pull the reference by, m/s2: a slope of 10 %; and part of the forces, for an unknown load.
 PULL_MPS2 = 1.0
@@ -56,6 +61,17 @@ APART_PART, APART_MPS, APART_S = 0.05, 0.5, 0.1
 #: wheels slip that way. Below the speed they stand, which a dead control unit shows too.
 AGREED_S = 1.0
 STANDING_MPS = 0.1
+#: A single wheel that rolls with the sensor while the others slip has to do so this many times longer.
+ALONE = 3.0
+#: An accelerometer sides with the speeds where it is this many times nearer to them than to the forces.
+NEARER = 0.5
+#: Deceleration by brakes of another system that a demand explains, as part of it and m/s2.
+ASKED_PART, ASKED_MPS2 = 1.25, 1.0
+#: A brake gives less than half of its torque where no road of this friction would let its wheel slip so little with it;
+#: one that gives less than the second part gives nothing, more than the third is no fault.
+BEST_ROAD, HALF, DEAD, WHOLE = 1.2, 0.5, 0.2, 0.8
+#: Nothing accelerates a car more than this, m/s2.
+MOST_MPS2 = 12.0
 #: A sensor must have been near the reference for this long before it is believed again.
 DISTRUST_S = 0.5
 #: Noise of a wheel's change in one step, rad/s; what a torque explains is taken times `TORQUE_MARGIN`.
@@ -100,6 +116,7 @@ class Motion(NamedTuple):
 
 
 NO_WHEELS = (0.0, 0.0, 0.0, 0.0)
+WHOLE_BRAKES = (1.0, 1.0, 1.0, 1.0)
 
 
 @kernel
@@ -295,7 +312,25 @@ def _started(shown: float, rims: Wheels) -> MotionState:
     start = _middle(rims)
     if not math.isnan(shown) and abs(shown - start) <= SPEED_PART * abs(start) + SPEED_MPS:
         start = shown
-    return MotionState(start, 0.0, shown, 0.0, 0.0, 0.0, 0.0, NO_WHEELS, NO_WHEELS, 0.0)
+    return _fresh(start, 0.0, shown, WHOLE_BRAKES)
+
+
+@kernel
+def _fresh(speed_mps: float, bias_mps2: float, shown_mps: float, brake_gain: Wheels) -> MotionState:
+    """A reference that nothing contradicts."""
+    return MotionState(
+        speed_mps=speed_mps,
+        bias_mps2=bias_mps2,
+        shown_mps=shown_mps,
+        shown_s=0.0,
+        moved_mps=0.0,
+        apart_s=0.0,
+        doubt_s=0.0,
+        wheel_stray_s=NO_WHEELS,
+        wheel_doubt_s=NO_WHEELS,
+        agreed=Agreed(0.0, 0.0, 0.0, 0.0),
+        brake_gain=brake_gain,
+    )
 
 
 class _Turning(NamedTuple):
@@ -318,7 +353,7 @@ class _Turning(NamedTuple):
 @kernel
 def _turning(
     w: Wheels,
-    wheels: tuple[WheelState, WheelState, WheelState, WheelState],
+    wheels: FourWheels,
     travel: float,
     first: bool,
     dt: float,
@@ -350,36 +385,146 @@ def _turning(
 
 
 @kernel
-def _agreed(
-    shown: float, rims: Wheels, predicted: float, t: _Turning, before: MotionState, dt: float
-) -> tuple[float, bool]:
-    """How long all five have agreed against the reference by now, and whether they are right.
+def _voted(
+    shown: float,
+    rims: Wheels,
+    predicted: float,
+    acceleration: float,
+    measurement: Measurement,
+    t: _Turning,
+    before: MotionState,
+    vehicle: VehicleParams,
+) -> tuple[Agreed, float, bool]:
+    """How long speeds have agreed against the reference by now, on which speed, and whether they are right.
 
     Wheels that stand say nothing: a dead control unit shows zeros too.
     """
-    doubt = before.wheel_doubt_s
+    none = Agreed(0.0, 0.0, 0.0, 0.0)
+    doubt, torque, dt = before.wheel_doubt_s, t.torque_nm, measurement.dt_s
     all_doubted = min(doubt[0], doubt[1], doubt[2], doubt[3]) > 0.0
-    mean = _middle(rims)
-    spread = AGREE_PART * abs(mean) + AGREE_MPS
-    together = max(rims[0], rims[1], rims[2], rims[3]) - min(rims[0], rims[1], rims[2], rims[3]) <= spread
     # Without a sensor wheels that are believed lead the reference by themselves.
-    confirmed = all_doubted if math.isnan(shown) else abs(shown - mean) <= spread
+    blind = math.isnan(shown)
+    mean = _middle(rims) if blind else shown
+    spread = AGREE_PART * abs(mean) + AGREE_MPS
+    count, own_nm = 0, 0.0
+    slipping, foreign = True, _foreign_brakes(vehicle)
+    for i in range(4):
+        if abs(rims[i] - mean) <= spread:
+            count += 1
+            own_nm += torque[i]
+        else:
+            braked = foreign and mean * (rims[i] - mean) < 0.0
+            slipping = slipping and (braked or torque[i] * (rims[i] - mean) > 0.0)
     near = abs(mean - predicted) <= SPEED_PART * abs(mean) + SPEED_MPS
-    if near or not (together and confirmed) or abs(mean) <= STANDING_MPS:
-        return 0.0, False
-    torque = t.torque_nm
-    front, rear = max(abs(torque[0]), abs(torque[1])), max(abs(torque[2]), abs(torque[3]))
+    enough = (count == 4 and all_doubted) if blind else slipping
+    if near or not enough or abs(mean) <= STANDING_MPS:
+        return none, mean, False
+    agreed = Agreed(dt, mean, 0.0, 0.0)
+    old = before.agreed
+    if old.lasted_s > 0.0:
+        felt = measurement.acceleration_mps2 * dt
+        agreed = Agreed(old.lasted_s + dt, old.from_mps, old.moved_mps + acceleration * dt, old.felt_mps + felt)
+    used = max(max(abs(torque[0]), abs(torque[1])) / t.front_nm, max(abs(torque[2]), abs(torque[3])) / t.rear_nm)
     # A driven wheel is never slower than the car, a braked one never faster; no skid makes a wheel doubted.
-    slip = (torque[0] + torque[1] + torque[2] + torque[3]) * (mean - predicted) > 0.0
-    slip = slip and not (all_doubted and max(front / t.front_nm, rear / t.rear_nm) < ROLLING_FRICTION)
-    agreed = before.agreed_s + dt
-    return agreed, agreed > (AGREED_S if slip else APART_S)
+    slip = own_nm * (mean - predicted) > 0.0 and not (all_doubted and used < ROLLING_FRICTION)
+    # What an accelerometer says, a slope taken off as the forces have it.
+    felt = agreed.felt_mps + before.bias_mps2 * agreed.lasted_s
+    off_speeds, off_forces = abs(felt - (mean - agreed.from_mps)), abs(felt - agreed.moved_mps)
+    if count == 0:
+        # No wheel rolls with the sensor: only an accelerometer tells that it is right.
+        return agreed, mean, agreed.lasted_s > ALONE * APART_S and off_speeds < NEARER * off_forces
+    if slip:
+        if off_forces < NEARER * off_speeds:
+            return agreed, mean, False
+        known = off_speeds < NEARER * off_forces or _others_brake(mean, agreed, measurement, vehicle)
+        slip = not (known or abs(before.bias_mps2) > BIAS_MPS2 or min(before.brake_gain) < 1.0)
+        if slip and count < 4:
+            return none, mean, False
+    enough_s = AGREED_S if slip else APART_S
+    if count == 1:
+        enough_s *= ALONE
+    return agreed, mean, agreed.lasted_s > enough_s
 
 
 @kernel
-def _restarted(mean: float, shown: float, before: MotionState) -> MotionState:
-    """The reference from five speeds that are right; what the forces did not explain stays."""
-    return MotionState(mean, before.bias_mps2, shown, 0.0, 0.0, 0.0, 0.0, NO_WHEELS, NO_WHEELS, 0.0)
+def _foreign_brakes(vehicle: VehicleParams) -> bool:
+    """Whether another system has the friction brakes."""
+    return max(vehicle.front.friction_brake.max_torque_nm, vehicle.rear.friction_brake.max_torque_nm) == 0.0
+
+
+@kernel
+def _others_brake(mean: float, agreed: Agreed, measurement: Measurement, vehicle: VehicleParams) -> bool:
+    """Whether brakes of another system do what the driver asks for."""
+    asked = -measurement.power_demand_w / (vehicle.chassis.mass_kg * max(abs(mean), SLOW_MPS))
+    slower = abs(agreed.from_mps) - abs(mean)
+    return _foreign_brakes(vehicle) and asked > 0.0 and slower <= (ASKED_PART * asked + ASKED_MPS2) * agreed.lasted_s
+
+
+@kernel
+def _restarted(
+    mean: float,
+    rims: Wheels,
+    agreed: Agreed,
+    shown: float,
+    wheels: FourWheels,
+    t: _Turning,
+    before: MotionState,
+    vehicle: VehicleParams,
+) -> MotionState:
+    """The reference from speeds that are right, and what that makes of the forces: brakes that are weak, or a slope."""
+    missed = (mean - agreed.from_mps - agreed.moved_mps) / agreed.lasted_s
+    if abs(missed) <= BIAS_MPS2:
+        return _fresh(mean, before.bias_mps2, shown, before.brake_gain)
+    sign = 1.0 if mean >= 0.0 else -1.0
+    lack = sign * missed
+    if lack < 0.0 and min(before.brake_gain) < 1.0:
+        return _fresh(mean, before.bias_mps2, shown, WHOLE_BRAKES)  # they are back
+    gain, found = _weak_brakes(lack, mean, rims, wheels, t, before.brake_gain, vehicle)
+    return _fresh(mean, _clamped(before.bias_mps2 + sign * (lack - found), MOST_MPS2), shown, gain)
+
+
+@kernel
+def _braked_n(rim: float, mean: float, wheel: WheelState, load_nm: float, axle: Axle) -> tuple[float, float]:
+    """Force that a wheel's friction brake is counted on for, N; and of it what no road can have taken at its slip."""
+    force = max(wheel.motor_nm - wheel.total_nm, 0.0) / axle.wheel.radius_m
+    most_nm = BEST_ROAD * load_nm * friction_coefficient(max(1.0 - rim / mean, 0.0), 1.0, axle.tyre)
+    return force, force if most_nm < HALF * abs(wheel.total_nm) else 0.0
+
+
+@kernel
+def _weak_brakes(
+    lack_mps2: float,
+    mean: float,
+    rims: Wheels,
+    wheels: FourWheels,
+    t: _Turning,
+    gain: Wheels,
+    vehicle: VehicleParams,
+) -> tuple[Wheels, float]:
+    """Part of each friction brake's torque that arrives, and how much of the lack of deceleration that explains."""
+    mass = vehicle.chassis.mass_kg
+    a, a_free = _braked_n(rims[0], mean, wheels[0], t.front_nm, vehicle.front)
+    b, b_free = _braked_n(rims[1], mean, wheels[1], t.front_nm, vehicle.front)
+    c, c_free = _braked_n(rims[2], mean, wheels[2], t.rear_nm, vehicle.rear)
+    d, d_free = _braked_n(rims[3], mean, wheels[3], t.rear_nm, vehicle.rear)
+    free_n = a_free + b_free + c_free + d_free
+    # Where all slip as they might with their torque, none is nearer to blame than another.
+    blamed_n = free_n if free_n > 0.0 else a + b + c + d
+    if lack_mps2 <= 0.0 or blamed_n == 0.0:
+        return gain, 0.0
+    part = max(1.0 - lack_mps2 * mass / blamed_n, 0.0)
+    if part > WHOLE:
+        return gain, 0.0
+    if part < DEAD:
+        part = 0.0
+    all_alike = free_n == 0.0
+    after = (
+        part * gain[0] if a_free > 0.0 or all_alike else gain[0],
+        part * gain[1] if b_free > 0.0 or all_alike else gain[1],
+        part * gain[2] if c_free > 0.0 or all_alike else gain[2],
+        part * gain[3] if d_free > 0.0 or all_alike else gain[3],
+    )
+    return after, min(lack_mps2, (1.0 - part) * blamed_n / mass)
 
 
 @kernel
@@ -439,18 +584,20 @@ def _used_wheels(
 @kernel
 def _bias_mps2(before: float, shown: float, predicted: float, trusted: bool, rolling: _Rolling, dt: float) -> float:
     """What the forces do not explain of a speed that is believed."""
-    if not (trusted and abs(predicted) > SLOW_MPS):
+    if abs(predicted) <= SLOW_MPS:
+        return _clamped(before, BIAS_MPS2)
+    if not trusted:
         return before
     gain = CONFIRMED_GAIN_PER_S2 if _confirmed(shown, rolling) else BIAS_GAIN_PER_S2
     step = gain * _clamped(shown - predicted, BIAS_STEP_MPS) * dt
-    return _clamped(before + step, BIAS_MPS2)
+    return _clamped(before + step, max(BIAS_MPS2, abs(before)))
 
 
 @kernel
 def estimate(
     measurement: Measurement,
     before: MotionState,
-    wheels: tuple[WheelState, WheelState, WheelState, WheelState],
+    wheels: FourWheels,
     travel: float,
     first: bool,
     vehicle: VehicleParams,
@@ -478,11 +625,11 @@ def estimate(
     if abs(before.speed_mps) > SLOW_MPS and not first:
         acceleration = forces - _resistance_mps2(before.speed_mps, vehicle) + before.bias_mps2
     predicted = before.speed_mps + acceleration * dt
-    agreed, right = _agreed(shown, rims, predicted, turning, before, dt)
+    agreed, mean, right = _voted(shown, rims, predicted, acceleration, measurement, turning, before, vehicle)
     if right:
-        predicted = _middle(rims)
-        before = _restarted(predicted, shown, before)
-        agreed = 0.0
+        predicted = mean
+        before = _restarted(mean, rims, agreed, shown, wheels, turning, before, vehicle)
+        agreed = before.agreed
     stray, doubt = _doubts(w, turning, predicted, acceleration, dt, before.wheel_stray_s, before.wheel_doubt_s, vehicle)
     rolling = _rolling(rims, doubt, turning)
     sensor = _judge_speed(shown, predicted, acceleration, dt, before, rolling)
@@ -516,7 +663,8 @@ def estimate(
         doubt_s=sensor.doubt_s,
         wheel_stray_s=stray,
         wheel_doubt_s=doubt,
-        agreed_s=agreed,
+        agreed=agreed,
+        brake_gain=before.brake_gain,
     )
     return motion, after
 

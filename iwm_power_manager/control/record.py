@@ -7,7 +7,9 @@ measurement and settings to the law again, starting from the initial state where
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from itertools import batched
 from typing import Any, NamedTuple, get_type_hints
 
 from iwm_power_manager.control.settings import DEFAULTS, Settings
@@ -40,10 +42,16 @@ _MEASUREMENT = (
     *(Signal(f"{wheel}_motor_gain", "part of a commanded torque the motor delivers, 0..1") for wheel in WHEEL_NAMES),
     Signal("direction", "direction the driver asks for: 1 forwards, -1 reverse"),
     *(Signal(f"{wheel}_motor_stuck_nm", "torque the motor has whatever it is commanded") for wheel in WHEEL_NAMES),
+    Signal("acceleration_mps2", "forward, of an accelerometer, the slope's part included"),
+    Signal("accelerometer", "1 where there is one, 0 where not"),
 )
 _COMMAND = (
     *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in WHEEL_NAMES),
     *(Signal(f"{wheel}_friction_torque_nm", "commanded friction brake torque, <= 0") for wheel in WHEEL_NAMES),
+    *(
+        Signal(f"{wheel}_brake_gain", "part of its friction torque a brake seems to give, 0..1")
+        for wheel in WHEEL_NAMES
+    ),
     Signal("front_share", "front axle's part of the power demand as applied, 0..1"),
     Signal("decided_share", "front share the strategy decided on, 0..1"),
     Signal("gate", "axles held at zero torque: 0 none, 1 front, 2 rear, 3 both"),
@@ -123,6 +131,8 @@ def to_numbers(
         *measurement.motor_gain,
         measurement.direction,
         *measurement.motor_stuck_nm,
+        0.0 if math.isnan(measurement.acceleration_mps2) else measurement.acceleration_mps2,
+        0.0 if math.isnan(measurement.acceleration_mps2) else 1.0,
         *decided(command, before, after),
         *supervision[:4],
         watch.wheels_lost,
@@ -135,6 +145,8 @@ def to_numbers(
 #: What a record that is older than a signal would have said.
 YOUNGER_SIGNALS = (
     {"gated_wheels": 0.0, "doubted": 0.0, "hold_nm": 0.0, "direction": 1.0}
+    | {"acceleration_mps2": 0.0, "accelerometer": 0.0}
+    | {f"{wheel}_brake_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_stuck_nm": 0.0 for wheel in WHEEL_NAMES}
     | {f"{side}_friction": 0.0 for side in ("left", "right")}
@@ -147,14 +159,14 @@ DECIDED_NAMES = tuple(signal.name for signal in (*_COMMAND, *_CONTROLLER))
 #: Where they stand among `SIGNALS`, and where the settings do.
 DECIDED = slice(len(_MEASUREMENT), len(_MEASUREMENT) + len(DECIDED_NAMES))
 SETTINGS = slice(len(SIGNALS) - len(_SETTINGS), len(SIGNALS))
-_COMMAND_TYPES = tuple(get_type_hints(Command).values())[2:]
+_COMMAND_TYPES = tuple(get_type_hints(Command).values())[3:]
 #: No number of a record that counts something is larger: beyond, a double has no integers.
 _LARGEST_COUNT = 2.0**53
 
 
 def decided(command: Command, before: ControllerState, after: ControllerState) -> tuple[float, ...]:
     """Values of `DECIDED_NAMES`."""
-    motor, friction = command.motor_torque_nm, command.friction_torque_nm
+    motor, friction, brakes = command.motor_torque_nm, command.friction_torque_nm, command.brake_gain
     front_left, front_right, rear_left, rear_right = after.wheels
     return (
         motor[0],
@@ -165,6 +177,10 @@ def decided(command: Command, before: ControllerState, after: ControllerState) -
         friction[1],
         friction[2],
         friction[3],
+        brakes[0],
+        brakes[1],
+        brakes[2],
+        brakes[3],
         command.front_share,
         command.decided_share,
         float(command.gate),
@@ -189,9 +205,9 @@ def decided(command: Command, before: ControllerState, after: ControllerState) -
 
 def command_of(numbers: Sequence[float]) -> Command:
     """The command among values of `DECIDED_NAMES`."""
-    a, b, c, d, e, f, g, h, *others = numbers[: len(_COMMAND)]
-    rest: list[Any] = [kind(value) for kind, value in zip(_COMMAND_TYPES, others, strict=True)]
-    return Command((a, b, c, d), (e, f, g, h), *rest)
+    motor, friction, brakes = ((a, b, c, d) for a, b, c, d in batched(numbers[:12], 4))
+    rest: list[Any] = [kind(value) for kind, value in zip(_COMMAND_TYPES, numbers[12 : len(_COMMAND)], strict=True)]
+    return Command(motor, friction, brakes, *rest)
 
 
 def measurement_of(numbers: Sequence[float]) -> Measurement:
@@ -209,6 +225,7 @@ def measurement_of(numbers: Sequence[float]) -> Measurement:
         motor_gain=(n[11], n[12], n[13], n[14]),
         direction=n[15],
         motor_stuck_nm=(n[16], n[17], n[18], n[19]),
+        acceleration_mps2=n[20] if n[21] else math.nan,
     )
 
 

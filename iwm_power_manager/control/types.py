@@ -8,6 +8,7 @@ second version of the law.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from iwm_power_manager.control.persistence import Jitter, no_jitter
@@ -58,6 +59,7 @@ class Measurement(NamedTuple):
     motor_gain : part of a commanded torque that each motor delivers, 0..1; 0 switches it off
     direction : the driver asks for, 1 forwards, -1 reverse
     motor_stuck_nm : torque that a motor has whatever it is commanded; friction makes up for it while braking
+    acceleration_mps2 : forward, of an accelerometer on the body, the slope's part included (NaN: there is none)
     """
 
     speed_mps: float
@@ -71,6 +73,7 @@ class Measurement(NamedTuple):
     motor_gain: Wheels = (1.0, 1.0, 1.0, 1.0)
     direction: float = 1.0
     motor_stuck_nm: Wheels = (0.0, 0.0, 0.0, 0.0)
+    acceleration_mps2: float = math.nan
 
 
 class Command(NamedTuple):
@@ -80,6 +83,7 @@ class Command(NamedTuple):
     ----------
     motor_torque_nm : torque of each motor at its wheel
     friction_torque_nm : torque of each friction brake, <= 0
+    brake_gain : part of it that each brake gives, as far as speeds and forces tell, 0..1
     front_share : P_front / P_demand as applied in this step (after its rate limit), 0..1
     decided_share : the front share the strategy decided on, 0..1
     gate : GATE_NONE, GATE_FRONT, GATE_REAR or GATE_BOTH: axles whose wheels are both gated
@@ -96,6 +100,7 @@ class Command(NamedTuple):
 
     motor_torque_nm: Wheels
     friction_torque_nm: Wheels
+    brake_gain: Wheels
     front_share: float
     decided_share: float
     gate: int
@@ -161,6 +166,22 @@ class SplitMemory(NamedTuple):
     jitter: Jitter
 
 
+class Agreed(NamedTuple):
+    """Speeds that agree with each other and not with the reference.
+
+    Attributes
+    ----------
+    lasted_s : for how long; 0 if they do not
+    from_mps : the speed they agreed on at first
+    moved_mps, felt_mps : what forces and accelerometer said of its change since (NaN: there is no accelerometer)
+    """
+
+    lasted_s: float
+    from_mps: float
+    moved_mps: float
+    felt_mps: float
+
+
 class MotionState(NamedTuple):
     """What `control.motion` remembers from step to step.
 
@@ -173,7 +194,8 @@ class MotionState(NamedTuple):
     doubt_s : time the speed sensor has yet to be good; 0 is believed
     wheel_stray_s : how long each wheel has stayed away although nothing holds it
     wheel_doubt_s : time each wheel has yet to be good
-    agreed_s : how long all five speeds have agreed with each other and not with the reference
+    agreed : speeds that outvote the forces
+    brake_gain : part of a friction torque that each brake gives, as found
     """
 
     speed_mps: float
@@ -185,7 +207,8 @@ class MotionState(NamedTuple):
     doubt_s: float
     wheel_stray_s: Wheels
     wheel_doubt_s: Wheels
-    agreed_s: float
+    agreed: Agreed
+    brake_gain: Wheels
 
 
 class WheelGrip(NamedTuple):
@@ -297,7 +320,8 @@ def initial_state() -> ControllerState:
             doubt_s=0.0,
             wheel_stray_s=none,
             wheel_doubt_s=none,
-            agreed_s=0.0,
+            agreed=Agreed(lasted_s=0.0, from_mps=0.0, moved_mps=0.0, felt_mps=0.0),
+            brake_gain=(1.0, 1.0, 1.0, 1.0),
         ),
         travel=1.0,
         hold_nm=0.0,

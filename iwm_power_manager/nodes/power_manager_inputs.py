@@ -25,6 +25,7 @@ from iwm_power_manager.signals.readings import (
     DemandReading,
     DirectionReading,
     FrictionReading,
+    MotionReading,
     TopicReader,
     TorqueReading,
     field_like,
@@ -206,3 +207,5 @@ def judge(monitor: InputMonitor, reading: Any, now_ns: int) -> None:
         monitor.take_torques(reading)
     elif kind is DirectionReading:
         monitor.direction = reading.direction
+    elif kind is MotionReading and reading.signal == "longitudinal_acceleration":
+        monitor.take_acceleration(reading.value, now_ns)

@@ -404,6 +404,7 @@ class PowerManager(Starting):
             controller.supervision.stale,
             controller.wheels_lost,
             controller.actuators.gains,
+            controller.brake_gain,
         )
         gate = controller and controller.command and controller.command.gate
         if self._changes.changed((self._active, self._fault, shown, gate), time.monotonic()):

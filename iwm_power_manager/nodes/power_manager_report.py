@@ -103,6 +103,7 @@ class PowerManagerReport:
                 self.doubts = [sensors.message] if sensors.level != diagnostics.OK else []
             statuses.append(sensors)
             statuses.append(diagnostics.motors_status(controller.actuators, self._wheel_names))
+            statuses.append(diagnostics.brakes_status(controller.brake_gain, self._wheel_names))
             statuses.append(self._loop.report(self._rate_hz, values))
         self._activity.clear()
         self._doubted.clear()

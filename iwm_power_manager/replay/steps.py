@@ -239,7 +239,7 @@ def possible_memories(
     travel = -1.0 if m.speed_mps < 0.0 else 1.0
 
     def wheel(i: int) -> WheelState:
-        torque_nm = travel * (command.motor_torque_nm[i] + command.friction_torque_nm[i])
+        torque_nm = travel * (command.motor_torque_nm[i] + command.brake_gain[i] * command.friction_torque_nm[i])
         slip = command.front_slip if i < 2 else command.rear_slip
         gated = bool(command.gated_wheels >> i & 1)
         motor_nm, speed_radps = travel * command.motor_torque_nm[i], travel * m.wheel_speed_radps[i]
@@ -250,7 +250,7 @@ def possible_memories(
         split=new.split._replace(
             decisions=step, age_s=m.dt_s, decided_share=command.decided_share, applied_share=command.front_share
         ),
-        motion=new.motion._replace(speed_mps=command.speed_mps, shown_mps=m.speed_mps),
+        motion=new.motion._replace(speed_mps=command.speed_mps, shown_mps=m.speed_mps, brake_gain=command.brake_gain),
         travel=travel,
         hold_nm=command.hold_nm,
         friction=new.friction._replace(

@@ -18,7 +18,7 @@ from iwm_power_manager.control.actuators import ActuatorState, MotorVerdict
 from iwm_power_manager.control.inputs import Violation, WheelVerdict
 from iwm_power_manager.control.monitor import Tally
 from iwm_power_manager.control.supervision import MODE_NAMES, MODE_NORMAL, STALE_NAMES, Supervision, binding_limits
-from iwm_power_manager.control.types import GATE_NAMES
+from iwm_power_manager.control.types import GATE_NAMES, Wheels
 from iwm_power_manager.ros.messages import ns_to_stamp
 
 OK, WARN, ERROR, STALE = range(4)
@@ -221,6 +221,19 @@ def motors_status(actuators: ActuatorState, wheel_names: Sequence[str]) -> Statu
             problems.append((ERROR, f"motor {name} is {_words(motor.verdict)}"))
     level, message = _worst(problems)
     return Status("motors", level, message, values)
+
+
+def brakes_status(gain: Wheels, wheel_names: Sequence[str]) -> Status:
+    """Which friction brakes give less than they are told, as speeds and forces have it."""
+    values = {
+        f"brake {name}: counted on (%)": f"{100.0 * part:.0f}" for name, part in zip(wheel_names, gain, strict=True)
+    }
+    problems = [
+        (ERROR, f"brake {name} is {'weak' if part else 'dead'}")
+        for name, part in zip(wheel_names, gain, strict=True)
+        if part < 1.0
+    ]
+    return Status("brakes", *_worst(problems), values)
 
 
 def sensors_status(doubted_steps: Mapping[int, int], steps: int, wheel_names: Sequence[str], *, agree: bool) -> Status:

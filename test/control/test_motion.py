@@ -293,3 +293,91 @@ def test_wheels_that_skid_on_ice_are_not_right_because_the_sensor_repeats_them()
         skid = max(0.6, 1.0 - 0.02 * k)
         motion = car.step(-60.0, lambda v, k=skid: k * v, wheels=lambda v, k=skid: [k * v / RADIUS] * 4)
     assert motion.speed_mps > 0.9 * car.v
+
+
+class Braked(Car):
+    """A car whose friction brakes do not all give what is commanded; one that slips shows it by a part of its speed."""
+
+    slips = (0.0,) * 4
+
+    def brake(self, torques, given, slips=(0.0,) * 4, felt=False, **spoil):
+        """One step with friction torques commanded, and those that really act."""
+        self.slips = tuple(old + (new - old) / 6.0 for old, new in zip(self.slips, slips, strict=True))
+        shown = tuple(w * (1.0 - slip) for w, slip in zip(self.rim, self.slips, strict=True))
+        v = spoil.get("spoil_speed", lambda v: v)(self.v)
+        rate = sum(given) / RADIUS / self.mass - resistance(self.v) - self.grade
+        m = Measurement(v, shown, -1e4, DT, 0.9, 1e5, 1e5, 0.5, acceleration_mps2=rate if felt else math.nan)
+        self.motion, after = estimate(m, self.state.motion, self.state.wheels, 1.0, self.state.steps == 0, CAR)
+        memory = tuple(
+            wheel._replace(total_nm=gain * torque, speed_radps=w)
+            for wheel, torque, gain, w in zip(self.state.wheels, torques, after.brake_gain, shown, strict=True)
+        )
+        self.state = self.state._replace(steps=self.state.steps + 1, motion=after, wheels=memory)
+        self.v += DT * rate
+        self.rim = [self.v / RADIUS] * 4
+        return self.motion
+
+
+def slips_of(given):
+    return tuple(-torque / 6000.0 for torque in given)
+
+
+@pytest.mark.parametrize("dead", [(0, 1), (2, 3), (0, 3), (1, 2)])
+def test_brakes_that_are_dead_are_found_and_no_sensor_is_doubted_for_long(dead):
+    car = Braked(25.0)
+    told = (-900.0,) * 4
+    given = tuple(0.0 if i in dead else torque for i, torque in enumerate(told))
+    for _ in range(20):
+        car.brake((0.0,) * 4, (0.0,) * 4)
+    doubted_s = 0.0
+    for _ in range(150):
+        v = car.v
+        motion = car.brake(told, given, slips_of(given))
+        doubted_s += DT * (motion.doubted != 0)
+        assert motion.speed_mps == pytest.approx(v, abs=2.5)
+    assert doubted_s <= 0.3
+    assert motion.doubted == 0
+    assert motion.speed_mps == v
+    assert car.state.motion.brake_gain == tuple(0.0 if i in dead else 1.0 for i in range(4))
+
+
+def test_brakes_that_come_back_are_counted_on_again():
+    car = Braked(35.0)
+    told, none = (-500.0,) * 4, (0.0,) * 4
+    for given in (none, (0.0, 0.0, -500.0, -500.0), told):
+        for _ in range(90):
+            motion = car.brake(none if given is none else told, given, slips_of(given))
+    assert motion.doubted == 0
+    assert car.state.motion.brake_gain == (1.0,) * 4
+
+
+@pytest.mark.parametrize("mass", [800.0, 1100.0])
+def test_a_loaded_car_has_no_weak_brakes(mass):
+    car = Braked(25.0)
+    car.mass = mass
+    for _ in range(200):
+        motion = car.brake((-400.0,) * 4, (-400.0,) * 4, slips_of((-400.0,) * 4))
+    assert motion.doubted == 0
+    assert car.state.motion.brake_gain == (1.0,) * 4
+
+
+@pytest.mark.parametrize("felt", [False, True])
+def test_a_force_that_nobody_knows_of_is_felt_by_an_accelerometer_at_once(felt):
+    car = Braked(30.0)
+    doubted_s = 0.0
+    for k in range(150):
+        given = (-700.0,) * 4 if k >= 30 else (-70.0,) * 4
+        motion = car.brake((-70.0,) * 4, given, (0.005,) * 4, felt)
+        doubted_s += DT * (motion.doubted != 0)
+    assert motion.doubted == 0
+    assert (doubted_s < 0.3) == felt
+
+
+def test_an_accelerometer_that_contradicts_four_skidding_wheels_and_their_sensor_is_believed():
+    """The sensor repeats the wheels; without an accelerometer they would be right after a second."""
+    car = Braked(30.0)
+    for k in range(250):
+        skid = max(0.5, 1.0 - 0.01 * max(k - 30, 0))
+        given = (-60.0,) * 4
+        motion = car.brake(given, given, (1.0 - skid,) * 4, True, spoil_speed=lambda v, skid=skid: skid * v)
+    assert motion.speed_mps == pytest.approx(car.v, abs=0.15 * car.v)

@@ -25,6 +25,7 @@ from iwm_power_manager.ros.diagnostics import (
     InputReport,
     LoopStatistics,
     Status,
+    brakes_status,
     control_status,
     motors_status,
     sensors_status,
@@ -196,3 +197,10 @@ def test_a_motor_that_does_not_follow_is_named():
     assert status.values["motor fl"] == "good"
     quiet = motors_status(ActuatorState(), ("fl", "fr", "rl", "rr"))
     assert (quiet.level, quiet.values["reported torque"]) == (OK, "none that follows the commands")
+
+
+def test_a_brake_that_gives_less_than_it_is_told_is_named():
+    status = brakes_status((1.0, 0.0, 0.4, 1.0), ("fl", "fr", "rl", "rr"))
+    assert (status.level, status.message) == (ERROR, "brake fr is dead; brake rl is weak")
+    assert status.values["brake rl: counted on (%)"] == "40"
+    assert brakes_status((1.0,) * 4, ("fl", "fr", "rl", "rr")).level == OK

@@ -53,6 +53,8 @@ def test_a_full_file_becomes_what_it_says(tmp_path):
             {"actuator": "motor_rear_left", "dead": True},
             {"message": "vehicle_speed", "lost": True, "from_s": 3.0},
         ],
+        "foreign_brakes": [{"from_s": 2.0, "braking_mps2": 4.0}],
+        "imu": True,
         "aim": {"lane_m": {"at_most": 2.0}},
         "require": {"stopping_distance_m": {"at_most": 50.0}, "least_braking": {"at_least": 0.8, "at_most": 1.2}},
     }
@@ -62,6 +64,7 @@ def test_a_full_file_becomes_what_it_says(tmp_path):
     assert car.yaw_inertia_kgm2 == pytest.approx(1.1 * believed.yaw_inertia_kgm2)
     assert (scenario.speed_mps, scenario.soc, scenario.direction, scenario.headwind_mps) == (20.0, 0.5, -1, 5.0)
     assert scenario.steering == ((1.0, math.pi / 2),)
+    assert (scenario.foreign_brakes, scenario.imu) == (((2.0, 4.0),), True)
     assert scenario.friction == (Friction(0.0, 0.2, 0.9), Friction(50.0, 0.4, 0.4))
     assert scenario.grade == ((0.0, 0.0), (10.0, 0.1))
     assert scenario.told_friction == 0.2
@@ -107,6 +110,8 @@ def test_a_cycle_and_a_vehicle_may_stand_beside_the_file(tmp_path):
         ({"until": None}, "until: is missing"),
         ({"until": {"time_s": 0.0}}, "until.time_s"),
         ({"until": {"time_s": 5.0, "standstill": 1}}, "until.standstill: 1 is neither"),
+        ({"foreign_brakes": [{"from_s": 0.0, "braking_mps2": -1.0}]}, r"foreign_brakes\[0\].braking_mps2: -1"),
+        ({"imu": "yes"}, "imu"),
         ({"steering": "race"}, "steering: 'race' is unknown"),
         ({"steering": [{"from_s": 0.0, "wheel_deg": 9999.0}]}, r"steering\[0\].wheel_deg"),
         ({"direction": "sideways"}, "direction: 'sideways' is unknown; allowed: forward | reverse"),
