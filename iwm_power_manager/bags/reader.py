@@ -77,7 +77,6 @@ class BagReader:
         self._stack = ExitStack()
         self._damage: list[str] = []
         self.sources: list[Source] = []
-        self._opened: list[Path] = []
         try:
             self.information, problem = read_metadata(self.path) if os.path.isdir(self.path) else ({}, "")
             self._damage += [problem] if problem else []
@@ -107,11 +106,7 @@ class BagReader:
     @property
     def damage(self) -> list[str]:
         """What could not be read so far, a line each; empty for a whole bag."""
-        return self._damage + [
-            f"{name}: {line}"  # not a copy's
-            for name, source in zip(self._opened, self.sources, strict=True)
-            for line in source.damage
-        ]
+        return self._damage + [f"{source.path}: {line}" for source in self.sources for line in source.damage]
 
     def messages(self) -> Iterator[Message]:
         """All messages in the order of their log times; equal times keep the order of the recording."""
@@ -161,7 +156,6 @@ class BagReader:
                 opened, problem = opened_file(name, self._stack, self.path if self.path != name else None)
                 self._damage += [f"{name}: {problem}"] if problem else []
                 self.sources.append(open_source(opened, name, self._stack))
-                self._opened.append(name)
             except BagError as error:
                 problems.append(str(error))
         if not self.sources:
@@ -212,9 +206,11 @@ def open_source(opened: Path, path: Path, stack: ExitStack) -> Source:
         raise BagError(f"{path}: cannot be read: {error.strerror or error}") from None
     sqlite = head == _SQLITE_MAGIC or (opened.suffix == ".db3" and not head.startswith(MAGIC))
     try:
-        return SqliteSource(opened, stack) if sqlite else McapSource(opened, stack)
+        source = SqliteSource(opened, stack) if sqlite else McapSource(opened, stack)
     except BagError as error:  # not under the name of a copy
         raise BagError(str(error).replace(str(opened), str(path))) from None
+    source.path = path
+    return source
 
 
 def data_files(folder: Path) -> list[Path]:
