@@ -228,6 +228,8 @@ class McapSource:
     definitions : schemas and channels
     counts : messages by channel, as far as chunks can be read
     metadata : contents of metadata records, by name
+    information : what rosbag2 keeps inside of the file of its `metadata.yaml`; {} if that is nothing or unreadable
+    custom_data : custom metadata inside of the file, our own recorder's or rosbag2's
     start_ns, end_ns : log times of the messages; 0 if there is none
 
     Raises
@@ -255,6 +257,9 @@ class McapSource:
         if self.data[: len(MAGIC)] != MAGIC:
             raise BagError(f"{path}: is no MCAP file")
         statistics = self._survey()
+        self.information = information_of(self.metadata.get("rosbag2", {}).get("serialized_metadata", ""))
+        own = self.metadata.get(CUSTOM_METADATA, {})
+        self.custom_data = text_values(self.information.get("custom_data")) | own
         known = self.definitions.channels.keys()
         if statistics is not None and known and statistics.channel_message_counts.keys() <= known:
             self.counts.update(statistics.channel_message_counts)
@@ -279,14 +284,6 @@ class McapSource:
                 channel.message_encoding,
             )
         return found
-
-    def information(self) -> dict[str, Any]:
-        """What rosbag2 keeps inside of the file of its `metadata.yaml`; {} if that is nothing or cannot be read."""
-        return information_of(self.metadata.get("rosbag2", {}).get("serialized_metadata", ""))
-
-    def custom_data(self) -> dict[str, str]:
-        """Custom metadata inside of the file, our own recorder's or rosbag2's."""
-        return text_values(self.information().get("custom_data")) | self.metadata.get(CUSTOM_METADATA, {})
 
     # --- the survey -------------------------------------------------------------------------------------------------
 

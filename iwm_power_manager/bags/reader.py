@@ -147,7 +147,7 @@ class BagReader:
             known = self.topics.setdefault(topic.name, topic)
             if (known.type, known.definition) != (topic.type, topic.definition) and topic.definition:
                 source.note(f"{topic.name} has more than one definition; it is read by the first")
-        self.custom_data = source.custom_data() | self.custom_data
+        self.custom_data = source.custom_data | self.custom_data
 
     def _open_all(self) -> None:
         problems = []

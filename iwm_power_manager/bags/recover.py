@@ -35,7 +35,7 @@ from iwm_power_manager.bags.mcap_source import (
     split,
     walk,
 )
-from iwm_power_manager.bags.metadata import FileSpan, Topic, read_metadata, text_values
+from iwm_power_manager.bags.metadata import FileSpan, Topic, bag_information, read_metadata, text_values
 from iwm_power_manager.bags.reader import (
     COMPRESSED_SUFFIX,
     SUFFIXES,
@@ -384,19 +384,19 @@ def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Ma
     distro = str(recorded.get("ros_distro") or "")
     for file in files:
         source = file.seen.source
-        custom_data.update(source.custom_data())
+        custom_data.update(source.custom_data)
         if isinstance(source, McapSource):  # "" is this one
-            known = source.information().get("ros_distro") or source.metadata.get("rosbag2", {}).get("ROS_DISTRO")
+            known = source.information.get("ros_distro") or source.metadata.get("rosbag2", {}).get("ROS_DISTRO")
             distro = distro or str(known or ("" if is_own(source) else "unknown"))
         for number, topic in file.seen.topics.items():
             topics.setdefault(topic.name, topic)
             counts[topic.name] += file.seen.counts[number]
-    write_metadata(
-        folder,
+    information = bag_information(
+        storage,
         [FileSpan(file.path.name, *file.seen.span, file.seen.count) for file in files],
         [(topic, counts[name]) for name, topic in topics.items()],
         custom_data | text_values(recorded.get("custom_data")),
-        storage=storage,
         distro=distro,
         compression="zstd" if any(file.seen.compressed for file in files) else "",
     )
+    write_metadata(folder, information)

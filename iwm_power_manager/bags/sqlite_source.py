@@ -52,6 +52,7 @@ class SqliteSource:
         self.counts: Counter[int] = Counter()
         self.start_ns = self.end_ns = 0
         self.header = Header(profile="ros2", library="")
+        self.custom_data: dict[str, str] = {}  # there is none in these files
         self._topics: dict[int, Topic] = {}
         self._steps = (SQLITE_INSTRUCTIONS + SQLITE_INSTRUCTIONS_PER_BYTE * regular_file(path)) // _STEP
         try:
@@ -79,14 +80,6 @@ class SqliteSource:
     def topics(self) -> dict[int, Topic]:
         """The topic of each id."""
         return self._topics
-
-    def information(self) -> dict[str, Any]:
-        """Nothing is kept inside that `metadata.yaml` does not say."""
-        return {}
-
-    def custom_data(self) -> dict[str, str]:
-        """There is none in these files."""
-        return {}
 
     def messages(self) -> Iterator[ChannelMessage]:
         """All messages in the order of their log times, of a damaged file in the order of recording."""

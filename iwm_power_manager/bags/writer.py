@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from iwm_power_manager import __version__
 from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
@@ -243,7 +243,7 @@ class BagWriter:
                 self._check_disk(wait=True)
         finally:
             topics = list(zip(self._topics, self._counts, strict=True))
-            write_metadata(self.path, self._spans, topics, self.custom_data)
+            write_metadata(self.path, bag_information("mcap", self._spans, topics, self.custom_data))
 
     def abandon(self) -> None:
         """Close without index and metadata, as a crash would leave the bag (see `recover`)."""
@@ -336,18 +336,8 @@ def finish(file: McapFile, channels: Sequence[tuple[Topic, int]], custom_data: M
     file.finish(sync=False)
 
 
-def write_metadata(
-    folder: Path,
-    spans: Sequence[FileSpan],
-    topics: Sequence[tuple[Topic, int]],
-    custom_data: Mapping[str, str],
-    *,
-    storage: str = "mcap",
-    distro: str = "",
-    compression: str = "",
-) -> None:
-    """Write a bag's `metadata.yaml`; `WriteFailed` if it cannot be. Arguments as of `metadata.bag_information`."""
-    information = bag_information(storage, spans, topics, custom_data, distro=distro, compression=compression)
+def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
+    """Write a bag's `metadata.yaml`; `WriteFailed` if it cannot be. What it says is of `metadata.bag_information`."""
     try:
         atomic_write(folder / METADATA_FILE, yaml_text({"rosbag2_bagfile_information": information}).encode())
     except ConfigError as error:

@@ -152,7 +152,8 @@ def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
         for kind, given in (("vehicle", choice.vehicle), ("policy", choice.policy), ("mapping", choice.mapping))
         if given is None and (name := str(recorded.get(_FILES[kind], ""))) and not _packaged(name)
     }
-    ask = f"give the files that the drive was recorded with, or others: {_list(missing)}"
+    files = ", ".join(f"{option} {name[:200]!r}" for option, name in missing.items())
+    ask = f"give the files that the drive was recorded with, or others: {files}"
     if "--vehicle" in missing:
         raise ConfigError("arguments", "", ask)
     vehicle_file = choice.vehicle or _packaged(recorded.get("vehicle_file")) or DEFAULT_VEHICLE
@@ -222,10 +223,6 @@ def _packaged(name: object) -> str:
         return str(path) if path.exists() and any(path.is_relative_to(folder) for folder in folders) else ""
     except (OSError, ValueError, RuntimeError):
         return ""  # no file can have such a name
-
-
-def _list(files: Mapping[str, str]) -> str:
-    return ", ".join(f"{option} {name[:200]!r}" for option, name in files.items())
 
 
 def _recorded_settings(recorded: Mapping[str, Any]) -> dict[str, Any]:
