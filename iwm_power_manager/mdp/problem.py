@@ -360,7 +360,7 @@ def read_axis(file: Path | str, key: str, value: Any, low: float, high: float, u
         first = check_number(file, dotted(key, "from"), value["from"], low, high, unit=unit)
         last = check_number(file, dotted(key, "to"), value["to"], first, high, unit=unit)
         step = check_number(file, dotted(key, "step"), value["step"], 0.0, high - low, above=True, unit=unit)
-        intervals = round((last - first) / step)
+        intervals = round(min((last - first) / step, 1e9))
         if abs(first + intervals * step - last) > 1e-6 * step:
             raise ConfigError(file, dotted(key, "step"), f"{step:g} does not divide {first:g} to {last:g}")
         if intervals >= MAX_AXIS_POINTS:

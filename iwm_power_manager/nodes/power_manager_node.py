@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter
 
 from iwm_power_manager.control.controller import Controller
 from iwm_power_manager.control.stepping import Lockstep, RealTime, Taken
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.errors import IwmError, one_line
 from iwm_power_manager.nodes import neighbours, pace
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.announcements import Announcements, input_topics
@@ -102,11 +102,16 @@ class PowerManager(Starting):
         try:
             prepared = self.take_preparation(self._values)
             self._adopt(prepared)
-        except IwmError as error:
-            self._fault = str(error)
+            self._appear(prepared)
+        except Exception as error:  # noqa: BLE001 - whatever stood behind it, the log and /diagnostics have the reason
+            self._fault = str(error) if isinstance(error, IwmError) else one_line(f"{type(error).__name__}: {error}")
             self.get_logger().error(self._fault)
             self._release()
             return TransitionCallbackReturn.FAILURE
+        return super().on_configure(state)
+
+    def _appear(self, prepared: Prepared) -> None:
+        """Be on the topics, and as the system is asked to run the process."""
         # Publishers and subscriptions of everything the signals file names, and of the state.
         self._outputs = Outputs(self, prepared, None if self._lockstep else self._period_s)
         self._inputs = Inputs(self, prepared.readers, self._on_demand if self._lockstep else None)
@@ -118,7 +123,6 @@ class PowerManager(Starting):
         rate = "in lock-step" if self._lockstep else f"{self._values['rate_hz']:g} Hz"
         resolved = [self.resolve_topic_name(topic) for topic in self._outputs.topics]
         self._says.interface(self._topics, resolved, rate)
-        return super().on_configure(state)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Start commanding, from the law's initial state."""

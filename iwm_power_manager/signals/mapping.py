@@ -40,7 +40,7 @@ DEFAULT_MAPPING = "config/signals/standard.yaml"
 WHEELS = 4
 #: Largest offset.
 _OFFSET = 1e9
-_TOPIC = re.compile(r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+_TOPIC = re.compile(r"(?!.{248})(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
 #: Longest name of a topic, with its namespace, that ROS allows.
 _LONGEST = 247
 #: Nobody's topics to command on or to take a number from.

@@ -132,6 +132,7 @@ def test_every_axis_may_have_a_single_point():
         ({"power_w": {"from": 0, "to": 10}}, "power_w.step: is missing"),
         ({"power_w": {"from": 0, "to": 10, "step": 0}}, "power_w.step: 0 is out of range"),
         ({"power_w": {"from": 0, "to": 10, "step": 3}}, "power_w.step: 3 does not divide 0 to 10"),
+        ({"power_w": {"from": 0, "to": 10, "step": 5e-324}}, "power_w.step: 4.94066e-324"),
         ({"power_w": {"from": 10, "to": 0, "step": 1}}, "power_w.to: 0 is out of range; allowed: 10 to 1e+06 W"),
         ({"power_w": {"from": 0, "to": 10000, "step": 1}}, "power_w.step: 1 gives 10001 points; allowed: <= 1000"),
         ({"slip_front": {"mirrored": [-0.1, 0.1]}}, "slip_front.mirrored[0]: -0.1 is out of range; allowed: 0 to 1"),

@@ -11,7 +11,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from sensor_msgs.msg import JointState
 
 from iwm_power_manager.control.controller import ControlFaultError, Controller
-from iwm_power_manager.nodes import preparation
+from iwm_power_manager.nodes import power_manager_node, preparation
 from iwm_power_manager.ros import messages, qos
 
 
@@ -27,12 +27,15 @@ def faults(node) -> list[str]:
     return [status.message for status in node.own_statuses() if status.name == "fault"]
 
 
-def test_an_error_while_configuring_leads_to_unconfigured_and_can_be_overcome(node, monkeypatch) -> None:
-    def broken(_values) -> None:
+@pytest.mark.parametrize(("module", "function"), [(preparation, "prepare"), (power_manager_node, "Outputs")])
+def test_an_error_while_configuring_leads_to_unconfigured_and_can_be_overcome(
+    node, monkeypatch, module, function
+) -> None:
+    def broken(*_) -> None:
         raise RuntimeError("out of luck")
 
     with monkeypatch.context() as patch:
-        patch.setattr(preparation, "prepare", broken)
+        patch.setattr(module, function, broken)
         assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
         assert node.lifecycle_state() == "unconfigured"
         assert faults(node) == ["RuntimeError: out of luck"]

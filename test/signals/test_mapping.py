@@ -25,13 +25,19 @@ def test_a_short_name_of_a_type_is_the_long_one(tmp_path: Path) -> None:
     assert load_mapping(path).sources["speed"][0].type == "std_msgs/msg/Float64"
 
 
+def resolved(name: str) -> str:
+    """Full name of a topic in the namespace /car; ROS fails at one that is far too long."""
+    assert len(name) < 248
+    return name if name.startswith("/") else f"/car/{name}"
+
+
 @pytest.mark.parametrize(
     ("entries", "problem"),
     [
         ("topic: 'a b'", "signals.speed.topic: 'a b' is no name of a topic; allowed: words of letters, digits and _"),
         *(
             (f"topic: '{name}'", "is no name of a topic")
-            for name in ("/a//b", "/a/", "/", "/1", "/a-b", "/ö", "/a/~b", "/" + "a" * 300)
+            for name in ("/a//b", "/a/", "/", "/1", "/a-b", "/ö", "/a/~b", "/" + "a" * 300, "a" * 245)
         ),
         ("topic: odom", "signals.soc.topic: /car/odom is /car/odom, and so is odom of signals.speed; allowed"),
         ("topic: splitter/state", "signals.speed.topic: /car/splitter/state is this node's own"),
@@ -44,7 +50,7 @@ def test_a_topic_is_refused_where_the_node_has_its_name_and_namespace(
     soc = "soc: {topic: /car/odom, field: b, unit: '1'}"
     mapping = load_mapping(mapping_file(tmp_path, f"signals: {{speed: {{{entries}, field: a, unit: m/s}}, {soc}}}"))
     with pytest.raises(ConfigError, match=r"mapping\.yaml") as caught:
-        mapping.check_topics(lambda name: name if name.startswith("/") else f"/car/{name}", ["/car/splitter/state"])
+        mapping.check_topics(resolved, ["/car/splitter/state"])
     assert problem in str(caught.value)
 
 
