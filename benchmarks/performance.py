@@ -459,13 +459,14 @@ def table(results: dict[str, Any]) -> str:
         of_peer = found.get("peer")
         theirs = f"{row.peer}: {seconds(of_peer)}" if of_peer else "-"
         before, now = found.get("before"), found["now"]
-        exact = now["exact"]
+        exact = [now["exact"]]
         if before and "series" in now:
-            exact += ", same bits as before" if before["series"] == now["series"] else ", not the bits of before"
+            exact.append("same bits as before" if before["series"] == now["series"] else "not the bits of before")
         if of_peer and of_peer.get("exact") and of_peer["cpu_s"]:
-            exact = f"{exact}; peer: {of_peer['exact']}"
+            exact.append(f"peer: {of_peer['exact']}")
+        error = "; ".join(filter(None, exact))
         goal = f"{row.goal()}: {'met' if row.met(now, of_peer) else 'missed'}" if row.goal() else ""
-        lines.append(f"| {row.what} | {theirs} | {seconds(before)} | {seconds(now)} | {goal} | {exact} |")
+        lines.append(f"| {row.what} | {theirs} | {seconds(before)} | {seconds(now)} | {goal} | {error} |")
     for name, (_, rows_of) in PROGRAMS.items():
         if name in results["programs"]:
             lines += [f"| {' | '.join(cells)} |" for cells in rows_of(results["programs"][name])]

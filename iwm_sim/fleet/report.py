@@ -252,7 +252,8 @@ def page_of(store: Store) -> tuple[Page, list[Savings]]:
         tiles.append(Tile("Policies", str(len(solves))))
     blocks = [Tiles(tiles), *(_drive_blocks(drives, savings[0].strategy) if savings else [])]
     if roads:
-        blocks.append(Table("Scenarios", _ROADS, roads))
+        ordered = sorted(roads, key=lambda row: (row["scenario"], car_of(row), row["strategy"], row["measure"]))
+        blocks.append(Table("Scenarios", _ROADS, ordered))
     if solves:
         note = "Expected are the changes a minute under the policy's own demand."
         blocks.append(Table("Policies", _POLICIES, solves, note))
