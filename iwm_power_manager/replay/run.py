@@ -8,7 +8,6 @@ steps are made from the mapped input signals.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -35,8 +34,6 @@ _STATE_OF_ANY = "/state"
 _STATE_READER = joint_state_reader("position")
 #: Messages between two calls of `progress`.
 PROGRESS_EVERY = 2000
-#: Readings from the bag's start that show whether its messages come in sets of one stamp.
-_PROBE_READINGS = 1000
 #: Below this share of the messages of the busiest topic, a replay says that it made few steps.
 _FEW_STEPS = 0.1
 #: How many topics are named that may be a command under another name, and what to do with one.
@@ -117,7 +114,7 @@ class Replay:
         self._stream = SignalStream(bag, plan.mapping, plan.vehicle.params)
         check_signals(bag, plan.mapping, self._stream, wheels=True)
         self._report.notes += [*self._stream.problems, *filter(None, [self._stream.use_log_times()])]
-        self._reconstructed = ReconstructedSteps(plan, itertools.islice(self._stream, _PROBE_READINGS))
+        self._reconstructed = ReconstructedSteps(plan, self._stream)
         self._stream.forget()
 
     @property
