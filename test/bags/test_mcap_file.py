@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 from pathlib import Path
+from typing import IO
 
 import pytest
 from mcap.reader import make_reader
@@ -93,30 +94,32 @@ def test_an_existing_file_is_never_touched(tmp_path: Path) -> None:
     assert (tmp_path / "a.mcap").read_bytes() == b"precious"
 
 
-def test_a_half_written_chunk_is_cut_off_and_what_was_written_before_is_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+class FullDisk:
+    """A file on a disk that takes `room` bytes more, then none."""
+
+    def __init__(self, stream: IO[bytes], room: int) -> None:
+        self.stream = stream
+        self.room = room
+
+    def write(self, data: memoryview) -> int:
+        if not self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written = self.stream.write(data[: self.room])
+        self.room -= written
+        return written
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.stream, name)
+
+
+@pytest.mark.parametrize("room", [0, 1, 100, 500, 1000, 1500])  # a chunk has some 300 bytes, the index of it 1600
+def test_a_chunk_that_is_not_written_with_its_index_is_cut_off_and_what_was_written_before_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
     file = fill(tmp_path / "a.mcap", 100)
     file.writer.flush()
     stream = file.stream
-
-    class FullDisk:
-        """Takes 100 bytes more, then none."""
-
-        def __init__(self) -> None:
-            self.room = 100
-
-        def write(self, data: memoryview) -> int:
-            if not self.room:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            written = stream.write(data[: self.room])
-            self.room -= written
-            return written
-
-        def __getattr__(self, name: str) -> object:
-            return getattr(stream, name)
-
-    monkeypatch.setattr(file, "stream", FullDisk())
+    monkeypatch.setattr(file, "stream", FullDisk(stream, room))
     for i in range(100):
         file.writer.add_message(1, 5000 + i, bytes(range(100)), 0)
     with pytest.raises(OSError, match="No space left"):
