@@ -16,6 +16,7 @@ from pathlib import Path
 
 from iwm_power_manager import __version__
 from iwm_power_manager.command_line import refuse_without_effect
+from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import check_number
@@ -25,7 +26,7 @@ from iwm_power_manager.policy import save_policy
 from iwm_power_manager.replay.recorded import read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import load_grid, targets
-from iwm_power_manager.tools.command import described, ended, write_json
+from iwm_power_manager.tools.command import described, ended, made_with, write_json
 from iwm_power_manager.tools.options import several, whole
 from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import load_vehicle
@@ -210,8 +211,9 @@ def _row(outcome: Outcome) -> dict[str, float | str | bool | None]:
 def _text(task: Task, learned: Learned, path: Path) -> str:
     drives = ", ".join(f"{cycle.name} ({cycle.duration_s:.0f} s)" for cycle in task.drives)
     equal_wh = learned.equal.energy_wh_per_km
+    how = made_with(f"{task.friction:g}", task.vehicle.idle_drive, 100.0, DEFAULTS.decision_period_s)
     lines = [
-        f"friction {task.friction:g}, idle drive {task.vehicle.idle_drive}; driven: {drives}",
+        f"{how}; driven: {drives}",
         f"equal split: {equal_wh:.2f} Wh/km; saved by policies, %:",
         "recorded second counts as   bandwidth   energy   with price of moves   changes/min   trace",
     ]

@@ -56,6 +56,12 @@ def test_every_link_leads_somewhere(page: Path) -> None:
     assert not broken_links(page)
 
 
+def test_make_help_says_of_every_target_how_long_it_takes() -> None:
+    targets = re.findall(r"^[a-z-]+:.*## (.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert len(targets) > 15
+    assert not [text for text in targets if not re.search(r"\((?:.*\b(?:min|hours?|seconds|minutes)\b.*)\)$", text)]
+
+
 def test_a_broken_link_is_found(tmp_path: Path) -> None:
     (tmp_path / "other.md").write_text("# Its `heading`, with signs\n")
     page = tmp_path / "page.md"
