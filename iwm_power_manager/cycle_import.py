@@ -17,8 +17,6 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.tables import Table, read_table
 from iwm_power_manager.trace_units import SPEED_UNITS, TIME_UNITS, FloatArray, implausible, likely_units
 
-#: What to do about a gap longer than `max_gap_s`.
-GAPS = ("refuse", "bridge", "cut")
 #: At a cut, the speed goes from one piece's end to the next one's start at this, m/s2.
 JOINT_MPS2 = 1.0
 _SHORTEST_STEP_S = 1e-4

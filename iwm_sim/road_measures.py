@@ -23,7 +23,6 @@ from iwm_sim.closed_loop import ROAD_COLUMNS, Run
 from iwm_sim.metrics import longest_s
 
 FloatArray = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 _WHEELS = ("fl", "fr", "rl", "rr")
 
