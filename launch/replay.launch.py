@@ -55,11 +55,10 @@ def generate_launch_description() -> LaunchDescription:
     play = RegisterEventHandler(
         OnStateTransition(target_lifecycle_node=power_manager, goal_state="active", entities=[player])
     )
-    ends = [
-        RegisterEventHandler(OnProcessExit(target_action=process, on_exit=[EmitEvent(event=Shutdown(reason=reason))]))
-        for process, reason in ((player, "the bag has ended"), (power_manager, "the power manager has ended"))
-    ]
+    end = RegisterEventHandler(
+        OnProcessExit(target_action=player, on_exit=[EmitEvent(event=Shutdown(reason="the bag has ended"))])
+    )
     arguments = [
         DeclareLaunchArgument(name, default_value=default, description=meaning) for name, default, meaning in ARGUMENTS
     ]
-    return LaunchDescription([*arguments, play, *ends, power_manager])
+    return LaunchDescription([*arguments, play, end, power_manager])
