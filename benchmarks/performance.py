@@ -90,6 +90,7 @@ ROWS = {
     "drive": Row("UDDS, `equal`, 100 Hz, four wheels and slip", clock_s=0.15),
     "drive_10hz": Row("UDDS, `equal`, 10 Hz, four wheels and slip", of_peer=1.0, peer="fastsim"),
     "lookahead": Row("UDDS, `sdp_lookahead`, 100 Hz", clock_s=0.5),
+    "step": Row("one step of the power manager, `sdp_lookahead`, NYCC: its 99th percentile", clock_s=100e-6),
     "imports": Row("imports of the solver alone"),
 }
 
@@ -329,6 +330,38 @@ def _step_error(run: Any, car: Any, dt_s: float, seconds: float = 0.2) -> str:
     return f"speed after {seconds:g} s within {1e3 * error:.2g} mm/s of its oracle"
 
 
+def step(repeat: int) -> dict[str, Any]:
+    """Times of single steps from checked inputs to commands, as the node runs them, without DDS; the slowest count."""
+    from iwm_power_manager.cycle import load_cycle
+    from iwm_power_manager.share import resolve
+    from iwm_power_manager.vehicle import load_vehicle
+    from iwm_sim.road_run import controller_of, drive_scenario
+    from iwm_sim.scenario import on_cycle
+
+    scenario = on_cycle(load_vehicle(resolve("jalalmaab_2015"), "drag"), load_cycle(resolve("nycc")), FRICTION)
+    runs: list[Any] = []
+    for _ in range(repeat + 1):
+        controller = controller_of(scenario)
+        own, taken = controller.step, []
+
+        def timed(*args: Any, own: Any = own, taken: list[Any] = taken) -> Any:
+            began, started = time.perf_counter(), time.thread_time()
+            made = own(*args)
+            taken.append((time.thread_time() - started, time.perf_counter() - began))
+            return made
+
+        controller.step = timed  # type: ignore[method-assign]
+        drive_scenario(scenario, controller)
+        runs.append(np.percentile(taken, (50, 99), axis=0))
+    middle, slow = np.array(runs[1:]).transpose(1, 0, 2)
+    return {
+        "cpu_s": slow[:, 0].tolist(),
+        "clock_s": slow[:, 1].tolist(),
+        "parts": {"median": float(np.median(middle[:, 1]))},
+        "exact": f"{len(taken):,} steps",
+    }
+
+
 def imports(_: int) -> dict[str, Any]:
     """What the solver's modules take before anything is solved."""
     started = time.process_time()
@@ -411,6 +444,7 @@ CHILDREN: dict[str, Callable[[int], dict[str, Any]]] = {
     "drive": lambda repeat: drive("equal", 0.01, repeat),
     "drive_10hz": lambda repeat: drive("equal", 0.1, repeat),
     "lookahead": lambda repeat: drive("sdp_lookahead", 0.01, repeat),
+    "step": step,
     "imports": imports,
     "quantecon": quantecon,
     "naive": naive,
