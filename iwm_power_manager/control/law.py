@@ -561,6 +561,17 @@ def _delivered_nm(motor_nm: Wheels, gain: Wheels, stuck_nm: Wheels) -> Wheels:
 
 
 @kernel
+def _arrived_nm(delivered: Wheels, friction: Wheels, gain: Wheels) -> Wheels:
+    """Torque of motor and brake at each wheel."""
+    return (
+        delivered[0] + gain[0] * friction[0],
+        delivered[1] + gain[1] * friction[1],
+        delivered[2] + gain[2] * friction[2],
+        delivered[3] + gain[3] * friction[3],
+    )
+
+
+@kernel
 def _frictions_nm(front: Shared, rear: Shared, delivered_nm: Wheels, braking: bool, vehicle: VehicleParams) -> Wheels:
     """Friction torque of each wheel."""
     return (
@@ -634,14 +645,12 @@ def _commanded(
     motor = (scale * wanted[0], scale * wanted[1], scale * wanted[2], scale * wanted[3])
     delivered = _delivered_nm(motor, measurement.motor_gain, measurement.motor_stuck_nm)
     friction = _frictions_nm(f, r, delivered, braking, vehicle)
-    brakes = state.motion.brake_gain
-    fl_nm, fr_nm = delivered[0] + brakes[0] * friction[0], delivered[1] + brakes[1] * friction[1]
-    rl_nm, rr_nm = delivered[2] + brakes[2] * friction[2], delivered[3] + brakes[3] * friction[3]
+    fl_nm, fr_nm, rl_nm, rr_nm = _arrived_nm(delivered, friction, state.motion.brake_gain)
     gate = (1 if front_gated else 0) + (2 if rear_gated else 0)
     command = Command(
         motor_torque_nm=motor,
         friction_torque_nm=friction,
-        brake_gain=brakes,
+        brake_gain=state.motion.brake_gain,
         front_share=memory.applied_share,
         decided_share=memory.decided_share,
         gate=gate,

@@ -32,6 +32,7 @@ def command(motor=(0.0,) * 4, friction=(0.0,) * 4, gated_wheels=0, gate=None) ->
     return Command(
         motor_torque_nm=tuple(motor),
         friction_torque_nm=tuple(friction),
+        brake_gain=(1.0,) * 4,
         front_share=0.5,
         decided_share=0.5,
         gate=gate,
