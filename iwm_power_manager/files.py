@@ -36,6 +36,8 @@ MAX_YAML_NODES = 20_000
 MAX_YAML_DEPTH = 32
 #: Characters of a number, in CSV and YAML.
 MAX_NUMBER_LENGTH = 40
+#: Characters of the name of a car or a grid.
+MAX_NAME_LENGTH = 100
 #: Characters of a line of a CSV.
 MAX_LINE_LENGTH = 4096
 
@@ -367,6 +369,14 @@ def check_choice(file: Path | str, key: str, value: Any, choices: Iterable[str])
         near = did_you_mean(spelled_like(value, choices)) if isinstance(value, str) else ""
         raise ConfigError(file, key, f"{value!r} is unknown", " | ".join(choices) + near)
     return value
+
+
+def check_name(file: Path | str, key: str, value: Any) -> str:
+    """`value` without space around it, if it is a text for tables and logs: printable, not empty, not long."""
+    if not (isinstance(value, str) and value.strip() and value.isprintable() and len(value) <= MAX_NAME_LENGTH):
+        allowed = f"a printable text that is not empty, {MAX_NAME_LENGTH} characters at most"
+        raise ConfigError(file, key, f"{value!r} is no name", allowed)
+    return value.strip()
 
 
 def check_bool(file: Path | str, key: str, value: Any) -> bool:

@@ -42,7 +42,7 @@ from iwm_power_manager.archive import read_npz
 from iwm_power_manager.control.budget import DEARER
 from iwm_power_manager.control.table import PolicyTable, as_vector
 from iwm_power_manager.errors import ConfigError, PolicyError
-from iwm_power_manager.files import atomic_write, check_number
+from iwm_power_manager.files import atomic_write, check_name, check_number
 from iwm_power_manager.mdp.budget import Trial
 from iwm_power_manager.mdp.demand import DemandChain, Source
 from iwm_power_manager.mdp.policy_iteration import GATED, Iteration, Solution, expect_over_demand
@@ -375,7 +375,7 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
     try:
         settings = {key: value for key, value in metadata["problem"].items() if key != "name"}
         problem = problem_from({"format": PROBLEM_FORMAT, **settings}, path)
-        problem = dataclasses.replace(problem, name=str(metadata["problem"]["name"]))
+        problem = dataclasses.replace(problem, name=check_name(path, "problem.name", metadata["problem"]["name"]))
         points = problem.power_w.size
         for name, shape in (
             ("front_share", problem.shape),
@@ -406,9 +406,9 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
             dearer_cost_j=arrays["dearer_cost_j"],
             trials=tuple(Trial(*row) for row in solver["prices_tried"]),
             chain=chain,
-            vehicle_name=str(metadata["vehicle"]["name"]),
-            vehicle_hash=str(metadata["vehicle"]["hash"]),
-            idle_drive=str(metadata["vehicle"]["idle_drive"]),
+            vehicle_name=check_name(path, "vehicle.name", metadata["vehicle"]["name"]),
+            vehicle_hash=check_name(path, "vehicle.hash", metadata["vehicle"]["hash"]),
+            idle_drive=check_name(path, "vehicle.idle_drive", metadata["vehicle"]["idle_drive"]),
             sources=tuple(metadata["demand"]["sources"]),
             iterations=tuple(Iteration(*row) for row in solver["iterations"]),
             bound_j=check_number(path, "bound_j", solver["bound_j"], 0.0),

@@ -63,8 +63,6 @@ class Vehicle:
 
 #: A map may reach beyond the car's top speed by this factor; rpm in a rad/s column are 9.5 times as many.
 MAX_MAP_SPEED_RATIO = 5.0
-#: Characters of a car's name: it stands in tables, logs and file names.
-MAX_NAME_LENGTH = 100
 _MOTOR_OPTIONS = ("loss", "efficiency_map", "mirror", "extrapolate")
 _IDLE_DRAG_KEYS = {"idle_standby_w", "idle_drag_constant_nm", "idle_drag_linear_nm_per_radps"}
 _OCV_KEYS = ("ocv_soc", "ocv_cell_v")
@@ -103,10 +101,7 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
     for key in ("gear", "front", "rear"):
         if key in content and content["format"] == 1:
             raise ConfigError(path, key, "is an unknown key in format 1", "format: 2")
-    name = content["name"]
-    if not (isinstance(name, str) and name.strip() and name.isprintable() and len(name) <= MAX_NAME_LENGTH):
-        allowed = f"a printable text that is not empty, {MAX_NAME_LENGTH} characters at most"
-        raise ConfigError(path, "name", f"{name!r} is no name", allowed)
+    name = files.check_name(path, "name", content["name"])
     drive = files.check_choice(path, "idle_drive", content["idle_drive"], IDLE_DRIVES)
     if idle_drive is not None:
         drive = files.check_choice("idle_drive override", "idle_drive", idle_drive, IDLE_DRIVES)
@@ -122,7 +117,7 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
     )
     _check_tips_over(path, params.chassis)
     plausibility.check_car(path, params, lambda axle, part: f"{axle}.{part}" if part in content.get(axle, {}) else part)
-    return Vehicle(name.strip(), path, drive, params, _hash(params), notes)
+    return Vehicle(name, path, drive, params, _hash(params), notes)
 
 
 def with_params(vehicle: Vehicle, name: str, params: VehicleParams) -> Vehicle:

@@ -281,6 +281,8 @@ def test_an_edit_without_a_new_checksum_is_refused(content, tmp_path_factory):
             "front_share has shape (3, 3, 3, 2, 3), its axes say (3, 3, 3, 2, 2)",
         ),
         (lambda m: m["solver"].update(iterations=[[1]]), "metadata is incomplete"),
+        (lambda m: m["problem"].update(name="\x1b[2J"), r"problem.name: '\x1b[2J' is no name; allowed: a printable"),
+        (lambda m: m["vehicle"].update(name="two\nlines"), r"vehicle.name: 'two\nlines' is no name"),
     ],
 )
 def test_metadata_that_cannot_be_right_is_refused_even_with_a_right_checksum(content, tmp_path_factory, change, words):
