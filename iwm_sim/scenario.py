@@ -43,7 +43,7 @@ from typing import Any, NamedTuple
 
 from iwm_power_manager import files
 from iwm_power_manager.cycle import MAX_GRADE, Cycle, load_cycle
-from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.errors import ConfigError, one_line
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
@@ -217,7 +217,7 @@ def load_scenario(name: Path | str, idle_drive: str | None = None, vehicle: Vehi
         imu=files.check_bool(path, "imu", content.get("imu", False)),
         faults=_faults(path, content.get("faults", [])),
         require=(*_bounds(path, content, "require"), *_bounds(path, content, "aim")),
-        about=" ".join(about.split()),
+        about=one_line(" ".join(about.split())),
         path=str(path),
         described=f"{vehicle.name} in {path.stem}, idle drive {vehicle.idle_drive}",
     )

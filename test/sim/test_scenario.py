@@ -37,6 +37,10 @@ def test_every_shipped_scenario_is_read_and_requires_something(path):
     assert scenario.about.endswith(".")
 
 
+def test_what_a_scenario_says_of_itself_steers_no_terminal(tmp_path):
+    assert load_scenario(write(tmp_path, GOOD | {"about": "A\n \x1b[2Jtest."})).about == r"A \x1b[2Jtest."
+
+
 def test_a_full_file_becomes_what_it_says(tmp_path):
     content = GOOD | {
         "load_kg": 80.0,
