@@ -16,8 +16,9 @@ raises an `iwm_power_manager.errors.IwmError`, whose text is one line.
 
 from __future__ import annotations
 
+import inspect
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,11 +27,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from iwm_power_manager.control.settings import Settings, default_settings
-from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES
+from iwm_power_manager.control.settings import TABLE, Settings, as_shown, check_together, default_settings, problem_with
+from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES, drivable
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.cycle import Cycle, load_cycle
-from iwm_power_manager.errors import ConfigError, IwmError
+from iwm_power_manager.errors import ConfigError, IwmError, did_you_mean, spelled_like
+from iwm_power_manager.files import check_number
 from iwm_power_manager.policy import Policy, choose, load_policy, load_policy_bank
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
@@ -38,6 +40,13 @@ from iwm_sim import closed_loop
 from iwm_sim.closed_loop import COLUMNS
 from iwm_sim.metrics import Metrics, measure
 from iwm_sim.study import rows
+from iwm_sim.study.names import MAX_DT_S
+
+#: Range of each number that a drive takes.
+_RANGES = {"friction": (0.05, 1.5), "soc": (0.0, 1.0), "dt_s": (1e-4, MAX_DT_S), "until_s": (MAX_DT_S, 1e9)}
+_OPTIONS = [
+    name for name, known in inspect.signature(closed_loop.run).parameters.items() if known.kind is known.KEYWORD_ONLY
+]
 
 __all__ = ["Bank", "Drive", "drive", "load_bank", "load_car", "load_cycle_file", "plot_share", "share_map"]
 
@@ -119,6 +128,7 @@ def drive(
     policy: Policy | None = None,
     strategy: str = "",
     settings: Settings | None = None,
+    rule: Sequence[float] = (),
     **options: Any,
 ) -> Drive:
     """Drive a cycle: driver, control law and plant in this process, as `evaluate` does.
@@ -129,8 +139,9 @@ def drive(
     car : what is driven
     friction : peak friction coefficient of the road
     policy : of this car; with one, the strategy is the default one
-    strategy : key of `control.strategies.STRATEGIES`; "" is `sdp_lookahead` with a policy and `equal` without
+    strategy : one of `control.strategies.drivable()`; "" is `sdp_lookahead` with a policy and `equal` without
     settings : of the law; its strategy is replaced
+    rule : coefficients a, b, c, d of strategy `rule`, as the power manager's parameter has them
     options : `dt_s` (control step, 0.01 s unless given), `soc` (at the start, 0..1), `until_s` and what else
         `closed_loop.run` takes
 
@@ -140,20 +151,43 @@ def drive(
     Raises
     ------
     ConfigError, PolicyError
-        A file is wrong, the strategy needs a policy, or the policy belongs to another car.
+        A file is wrong, a number out of its range, a policy is missing or belongs to another car.
     """
     name = strategy or (DEFAULT_STRATEGY if policy else "equal")
-    if name not in STRATEGIES:
-        raise ConfigError("arguments", "strategy", f"{name!r} is none", ", ".join(STRATEGIES))
-    if STRATEGIES[name].needs_policy and policy is None:
-        raise ConfigError("arguments", "policy", f"is missing; {name} needs one")
+    _check(name, policy, rule, settings or default_settings(), {"friction": friction, **options})
     loaded = load_cycle_file(cycle) if isinstance(cycle, str) else cycle
     if policy is not None:
         policy.check_vehicle(car)
     law = (settings or default_settings())._replace(strategy=STRATEGIES[name].code)
-    table = policy.table() if policy is not None and STRATEGIES[name].needs_policy else empty_table()
+    table = policy.table() if policy is not None and STRATEGIES[name].needs_policy else empty_table(rule=rule)
     run = closed_loop.run(loaded, car, law, table, friction, **options)
     return Drive(name, loaded, car, run, measure(run, car.params))
+
+
+def _check(
+    strategy: str, policy: Policy | None, rule: Sequence[float], settings: Settings, options: Mapping[str, Any]
+) -> None:
+    """Refuse what cannot be driven, as the commands do."""
+    if strategy not in drivable():
+        future = strategy in STRATEGIES and STRATEGIES[strategy].knows_future
+        problem = "knows the whole cycle; `evaluate --strategy preview` plans and drives it" if future else "is none"
+        raise ConfigError("arguments", "strategy", f"{strategy!r} {problem}", ", ".join(drivable()))
+    if STRATEGIES[strategy].needs_policy and policy is None:
+        raise ConfigError("arguments", "policy", f"is missing; {strategy} needs one")
+    if len(rule) != (4 if strategy == "rule" else 0):
+        raise ConfigError("arguments", "rule", f"has {len(rule)} numbers", "four for strategy rule, none for others")
+    for key, value in options.items():
+        if key in _RANGES and not (key == "until_s" and value == np.inf):
+            check_number("arguments", key, value, *_RANGES[key])
+        elif key != "friction" and key not in _OPTIONS:
+            near = did_you_mean(spelled_like(key, _OPTIONS))
+            raise ConfigError("arguments", key, "is no option", ", ".join(_OPTIONS) + near)
+    shown = as_shown(settings)
+    for key, value in shown.items():
+        if key in TABLE and problem_with(TABLE[key], value):
+            raise ConfigError("settings", key, problem_with(TABLE[key], value))
+    if problem := check_together(shown):
+        raise ConfigError("settings", "", problem)
 
 
 def share_map(

@@ -16,7 +16,11 @@ from iwm_power_manager.control.inputs import StampLimits, ValueLimits, WheelLimi
 from iwm_power_manager.control.monitor import InputLimits
 from iwm_power_manager.control.settings import Change, Setting
 from iwm_power_manager.control.supervision import SupervisionLimits
+from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.pedals import PEDAL_TRAVEL, demand_power_w
 
+#: More than this many times what the car's own pedals ask for is no demand.
+_BEYOND_PEDALS = 1.5
 _INF = math.inf
 
 
@@ -88,8 +92,12 @@ class Thresholds:
     motor_recover_s: float = _threshold(
         2.0, "s", 0.0, 600.0, "a weak motor has to follow for this long to count as good again"
     )
-    demand_max_w: float = _threshold(150e3, "W", 100.0, 5e6, "largest believed driving demand")
-    demand_min_w: float = _threshold(-600e3, "W", -2e7, -100.0, "largest believed braking demand, negative")
+    demand_max_w: float = _threshold(
+        150e3, "W", 100.0, 5e6, "largest believed driving demand; what the car's own pedal asks for is, too"
+    )
+    demand_min_w: float = _threshold(
+        -600e3, "W", -2e7, -100.0, "largest believed braking demand, < 0; what the car's own pedal asks for is, too"
+    )
     demand_rise_wps: float = _threshold(
         5e6, "W/s", 1e3, 1e9, "largest believed rise of the demand; braking may come as fast as it likes"
     )
@@ -174,6 +182,22 @@ def supervision_limits(thresholds: Thresholds) -> SupervisionLimits:
     t = thresholds
     return SupervisionLimits(
         fade_s=t.fade_s, brake_release_s=t.brake_release_s, recover_s=t.recover_s, resume_s=t.resume_s
+    )
+
+
+def for_car(thresholds: Thresholds, vehicle: VehicleParams) -> Thresholds:
+    """Thresholds that believe what a car's own pedals ask for, at any speed that is believed.
+
+    A heavy or strong car asks for more than the defaults: a full stop of 2.8 t from 30 m/s for 800 kW.
+    """
+    accelerator, brake = (
+        _BEYOND_PEDALS * float(demand_power_w(PEDAL_TRAVEL, *travel, thresholds.speed_max_mps, vehicle))
+        for travel in ((1.0, 0.0), (0.0, 1.0))
+    )
+    return dataclasses.replace(
+        thresholds,
+        demand_max_w=max(thresholds.demand_max_w, accelerator),
+        demand_min_w=min(thresholds.demand_min_w, brake),
     )
 
 

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from iwm_power_manager.control.controller import Controller, ControllerLimits
+from iwm_power_manager.control.inputs import ValueLimits
 from iwm_power_manager.control.monitor import DEMAND
-from iwm_power_manager.control.thresholds import actuator_limits, input_limits, supervision_limits
+from iwm_power_manager.control.thresholds import actuator_limits, for_car, input_limits, supervision_limits
 from iwm_power_manager.errors import BagError, ConfigError, IwmError, did_you_mean, spelled_like
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
@@ -71,7 +72,7 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
     mapping = load_mapping(resolve(values["signals_file"]))
     if values["signals_file"] == DEFAULT_MAPPING:
         mapping = mapping.with_wheel_names(names)
-    thresholds = config.thresholds_of(values)
+    thresholds = for_car(config.thresholds_of(values), vehicle.params)
     limits = ControllerLimits(
         input_limits(thresholds, vehicle.params.front.wheel.radius_m, by_clock=not values["lockstep"]),
         None if values["lockstep"] else config.age_limits_s(values),
@@ -83,7 +84,7 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
     friction = settings.friction_prior if estimated else values["friction"]
     table = policies.table(friction)
     controller = Controller(mapping.car(vehicle.params), names, limits, settings, table, friction)
-    readers, commands = _interface(mapping, controller, vehicle, values)
+    readers, commands = _interface(mapping, controller, vehicle, values, limits.inputs.demand)
     # The first call compiles the law or reads it from the cache: seconds that no control step may take.
     for warmed in policies.tables():
         controller.policy = warmed
@@ -99,7 +100,7 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
 
 
 def _interface(
-    mapping: SignalMapping, controller: Controller, vehicle: Vehicle, values: Mapping[str, Any]
+    mapping: SignalMapping, controller: Controller, vehicle: Vehicle, values: Mapping[str, Any], demand: ValueLimits
 ) -> tuple[dict[str, TopicReader], dict[str, CommandWriter]]:
     mapping.check_live()
     demands = {source.topic for signal in (*DEMANDS, *PEDALS) for source in mapping.sources.get(signal, ())}
@@ -117,7 +118,7 @@ def _interface(
     commands = {kind: CommandWriter(mapping.path, sinks) for kind, sinks in mapping.commands.items()}
     readers = topic_readers(mapping, types, assembly)
     assembly.warm(mapping.sources)
-    limits = f"demand_min_w {values['demand_min_w']:g} to demand_max_w {values['demand_max_w']:g}"
+    limits = f"demand_min_w {demand.minimum:g} to demand_max_w {demand.maximum:g}"
     monitor.tallies[DEMAND].describe = lambda: f"{assembly.wanted_in_words()}; allowed: {limits}"
     return readers, commands
 

@@ -36,6 +36,7 @@ def jobs() -> Iterator[Job]:
     from iwm_power_manager.control.record import DECIDED_NAMES, SIGNALS
     from iwm_power_manager.control.repeat import repeat
     from iwm_power_manager.control.settings import default_settings
+    from iwm_power_manager.control.thresholds import Thresholds, for_car
     from iwm_power_manager.control.types import Measurement, initial_state
     from iwm_power_manager.cycle import Cycle
     from iwm_power_manager.mdp.demand import chain_of, cycle_source, driven_source
@@ -56,6 +57,7 @@ def jobs() -> Iterator[Job]:
     settings = default_settings()
 
     def control_law() -> None:
+        for_car(Thresholds(), vehicle.params)
         discharge, charge = battery_limits_w(0.8, 25.0, vehicle.params.battery)
         measurement = Measurement(1.0, (3.0, 3.0, 3.0, 3.0), 500.0, 0.01, 0.9, discharge, charge, 0.8)
         law.step(measurement, initial_state(), settings, vehicle.params, table)

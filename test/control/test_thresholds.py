@@ -11,6 +11,9 @@ import pytest
 from iwm_power_manager.control import settings, thresholds
 from iwm_power_manager.control.settings import Change
 from iwm_power_manager.control.thresholds import RECORDED, Thresholds, actuator_limits, input_limits, supervision_limits
+from iwm_power_manager.model.pedals import PEDAL_TRAVEL, demand_power_w
+from iwm_power_manager.share import resolve
+from iwm_power_manager.vehicle import load_vehicle
 
 DIFFERENT = Thresholds(*(float(k + 1) for k in range(len(thresholds.TABLE))))
 
@@ -104,3 +107,19 @@ def test_text_becomes_a_value_and_comes_back():
 def test_when_each_may_change_is_known():
     assert {known.change for known in settings.TABLE.values()} == {Change.ALWAYS}
     assert {known.change for known in thresholds.TABLE.values()} == {Change.UNCONFIGURED}
+
+
+@pytest.mark.parametrize("name", ["jalalmaab_2015", "compact_two_motors"])
+@pytest.mark.parametrize("mass", [1.0, 4.0], ids=["", "heavy"])
+def test_what_a_car_s_own_pedals_ask_for_is_believed_at_any_speed_that_is(name, mass):
+    params = load_vehicle(resolve(name)).params
+    params = params._replace(chassis=params.chassis._replace(mass_kg=mass * params.chassis.mass_kg))
+    found = input_limits(thresholds.for_car(Thresholds(), params), 0.3, by_clock=True)
+    for speed in (0.0, 20.0, found.speed.maximum):
+        assert demand_power_w(PEDAL_TRAVEL, 1.0, 0.0, speed, params) <= found.demand.maximum
+        assert demand_power_w(PEDAL_TRAVEL, 0.0, 1.0, speed, params) >= found.demand.minimum
+
+
+def test_a_threshold_that_is_wider_than_the_car_s_pedals_stays_as_it_is():
+    wide = Thresholds(demand_max_w=5e6, demand_min_w=-2e7)
+    assert thresholds.for_car(wide, load_vehicle(resolve("compact_two_motors")).params) == wide

@@ -19,6 +19,7 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
 
+from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes import preparation
 from iwm_power_manager.ros import messages, qos
 from iwm_power_manager.ros.asking import Question
@@ -166,6 +167,13 @@ def test_locked_parameters_change_only_while_it_is_not_active(start_pair) -> Non
     assert bench.change_state("deactivate")
     assert bench.set_parameter("friction", 0.4) == ""
     assert bench.set_parameter("lock_parameters", False) != ""
+
+
+def test_the_full_stop_and_full_throttle_of_a_strong_car_are_believed() -> None:
+    car = {"vehicle_file": "config/vehicles/compact_two_motors.yaml", "policy_file": "", "strategy": "equal"}
+    monitor = preparation.prepare(config.DEFAULTS | car).controller.monitor
+    assert monitor.take_demand(300e3, 0.0, 10**9)
+    assert monitor.take_demand(-750e3, 0.0, 2 * 10**9)
 
 
 def test_services_are_answered_while_it_prepares(node: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.errors import ConfigError, IwmError
 from iwm_sim import api
 from iwm_sim.closed_loop import COLUMNS
@@ -70,6 +71,31 @@ def test_bad_input_is_one_line(car, bank):
     other = api.load_car("jalalmaab_2015", idle_drive="none")
     with pytest.raises(IwmError, match="was solved for"):
         api.drive("nycc", other, 0.9, bank.nearest(0.9))
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ({"friction": 9}, "friction: 9 is out of range"),
+        ({"soc": 8.0}, "soc: 8.0 is out of range"),
+        ({"dt_s": -1}, "dt_s: -1 is out of range"),
+        ({"untils": 3}, "until_s"),
+        ({"strategy": "preview"}, "knows the whole cycle"),
+        ({"strategy": "rule"}, "rule: has 0 numbers"),
+        ({"settings": default_settings()._replace(decision_period_s=-1.0)}, "decision_period_s: -1.0 is not allowed"),
+        ({"settings": default_settings()._replace(slip_target=0.5)}, "slip_target"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused_in_one_line(car, what, said):
+    with pytest.raises(IwmError, match=re.escape(said)) as error:
+        api.drive("nycc", car, **{"friction": 0.9, "strategy": "equal", **what})
+    assert "\n" not in str(error.value)
+
+
+def test_a_rule_drives_by_its_coefficients(car):
+    front = api.drive("nycc", car, 0.9, strategy="rule", rule=(0.0, 1.0, 0.0, 1.0), until_s=60.0)
+    equal = api.drive("nycc", car, 0.9, strategy="equal", until_s=60.0)
+    assert front.run["front_power_w"].max() > 1.5 * equal.run["front_power_w"].max()
 
 
 def test_the_page_names_every_column_of_a_frame():
