@@ -311,7 +311,8 @@ def check_keys(
         raise ConfigError(file, parent, f"{mapping!r} is no mapping", f"the keys {', '.join(known)}")
     for key in mapping:
         if key not in known:
-            raise ConfigError(file, dotted(parent, key), "is an unknown key", ", ".join(known))
+            near = did_you_mean(spelled_like(str(key), known))
+            raise ConfigError(file, dotted(parent, key), "is an unknown key", ", ".join(known) + near)
     for key in required:
         if key not in mapping:
             raise ConfigError(file, dotted(parent, key), "is missing")

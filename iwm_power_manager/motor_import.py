@@ -13,11 +13,11 @@ from iwm_power_manager.motor_map import COLUMNS, RANGES
 from iwm_power_manager.tables import Table, read_table
 
 RAD_S_PER_RPM = 2.0 * math.pi / 60.0
-_SPEED_NAMES = {"rpm": r"\brpm|1/min|min-1|min\^-1|u/min", "rad/s": r"rad_?/?s\b|rad_?per_?s|radps"}
+_SPEED_NAMES = {"rpm": r"\brpm|1/min|min-1|min\^-1|u/min", "rad/s": r"rad ?/?s\b|rad ?per ?s|radps"}
 _NOTHING = ("", "nan", "-", "n/a", "na", "null", "none", "inf", "n.a.", "k.a.")
 #: Units that are not read, by what the option that settles it is.
 _OTHER_UNITS = {
-    "speeds": (r"km/?h|\bkph|\bmph|\bm/s|\bkrpm|\brps|\b1/s|\bs\^?-1|\bhz\b|(deg|°)/s", "rad/s or rpm: --speed-unit"),
+    "speeds": (r"km[/ ]?h\b|\bkph|\bmph|\bm/s|\bkrpm|\brps|\b1/s|\bs\^?-1|\bhz\b|(deg|°)/s", "rad/s or rpm: --speed-unit"),
     "torques": (r"\b[km]n[ ·*]?m\b|\blbf?|\bft\b|\boz", "N m"),
     "losses": (r"\b[km]w\b", "W"),
 }
@@ -74,6 +74,8 @@ def read_points(
         raise ConfigError("arguments", "--down", f"has no effect: {path} is read as a list", "--layout matrix with it")
     header = [cell for _, cells in _header(table) for cell in cells if not _is_number(table, cell)]
     speed_unit, doubts = _speed_unit(path, header, speed_unit, said)
+    if layout == "matrix" and down == "speed" and header and _torque_first(header[-1]):
+        doubts.append(f"speeds down, torques across, although the corner says {header[-1]!r}: --down torque?")
     _check_quantity(path, header, quantity)
     try:
         cells = _list(table, said) if layout == "list" else _matrix(table, down)
@@ -81,7 +83,9 @@ def read_points(
         if not guessed or layout == "list":
             raise
         problem = f"{error.problem} (taken for a matrix, as it has {columns} columns)"
-        raise ConfigError(path, error.key, problem, "for a list three columns: speed, torque, value") from None
+        listed = "for a list three columns: speed, torque, value (--layout list)"
+        allowed = f"{error.allowed}; {listed}" if error.allowed else listed
+        raise ConfigError(path, error.key, problem, allowed) from None
     if percent is None and quantity == "efficiency":
         values = [value for _, _, _, value in cells if value > 0.0]
         percent = 2 * sum(value > 1.5 for value in values) > len(values)
@@ -125,9 +129,10 @@ def _header(table: Table) -> list[tuple[int, list[str]]]:
 
 def _speed_unit(path: Path | str, header: list[str], chosen: str, said: list[str]) -> tuple[str, list[str]]:
     """The unit of the speeds, and what is doubtful about it."""
-    named = next((unit for unit, names in _SPEED_NAMES.items() if re.search(names, " ".join(header), re.I)), "")
+    plain = [cell.replace("_", " ") for cell in header]  # where a word ends: speed_rpm
+    named = next((unit for unit, names in _SPEED_NAMES.items() if re.search(names, " ".join(plain), re.I)), "")
     for what, (names, allowed) in _OTHER_UNITS.items():
-        strange = next((cell for cell in header if re.search(names, cell, re.IGNORECASE)), None)
+        strange = next((cell for cell, words in zip(header, plain, strict=True) if re.search(names, words, re.I)), None)
         if strange is not None and not (what == "speeds" and (named or chosen != "auto")):
             raise ConfigError(path, "", f"the header says {strange!r}: {what} in another unit", allowed)
     if chosen == "auto":
@@ -135,6 +140,12 @@ def _speed_unit(path: Path | str, header: list[str], chosen: str, said: list[str
         return named or "rad/s", []
     doubt = f"speeds in {chosen}, as --speed-unit says, although the header says {named}"
     return chosen, [] if named in ("", chosen) else [doubt]
+
+
+def _torque_first(head: str) -> bool:
+    """Whether the corner of a matrix names torques before speeds, as torque\\speed: what goes down, what across."""
+    torque, speed = _TORQUE.search(head), _SPEED.search(head)
+    return torque is not None and speed is not None and torque.start() < speed.start()
 
 
 def _check_quantity(path: Path | str, header: list[str], quantity: str) -> None:

@@ -104,6 +104,8 @@ def test_numbers_are_read_as_yaml_1_2_writes_them(tmp_path):
 
 def test_keys_are_checked_against_what_is_known():
     assert files.check_keys("f", {"a": 1}, ("a",), ("b",)) == {"a": 1}
+    with pytest.raises(ConfigError, match=r"unknown key; allowed: speed, torque; did you mean speed\?$"):
+        files.check_keys("f", {"sped": 1}, ["speed"], ["torque"])
     with pytest.raises(ConfigError, match=r"^f: top\.c: is an unknown key; allowed: a, b$"):
         files.check_keys("f", {"a": 1, "c": 2}, ("a",), ("b",), "top")
     with pytest.raises(ConfigError, match=r"^f: a: is missing$"):

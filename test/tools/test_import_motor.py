@@ -75,6 +75,20 @@ def test_a_matrix_with_decimal_commas_behind_a_gear(tmp_path, capsys, down):
     same(tmp_path / "map.csv")
 
 
+def test_units_of_both_axes_stand_in_the_corner_of_a_matrix(tmp_path, capsys):
+    lines = ["torque_nm\\speed_rpm," + ",".join(f"{w * RPM:.9f}" for w in WHOLE.speed_radps)]
+    for j, t in enumerate(WHOLE.torque_nm):
+        lines.append(f"{t}," + ",".join(f"{efficiency(i, j):.9f}" for i in range(WHOLE.speed_radps.size)))
+    table = tmp_path / "sheet.csv"
+    table.write_text("\n".join(lines) + "\n")
+    code, out, err = run(capsys, table, "--output", tmp_path / "map.csv", "--down", "torque")
+    assert (code, err) == (0, "")
+    assert "speeds in rpm, as the header says" in out
+    same(tmp_path / "map.csv")
+    err = run(capsys, table, "--output", tmp_path / "map.csv")[2]
+    assert r"although the corner says 'torque_nm\\speed_rpm': --down torque?" in err
+
+
 def test_losses_become_efficiencies(tmp_path, capsys):
     table = tmp_path / "sheet.tsv"
     rows = [(w, t, w * t / e - w * t) for w, t, e in points()]
@@ -123,7 +137,9 @@ def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys)
         ("krpm,Nm,eta\n1,2,0.4\n", (), "'krpm': speeds in another unit"),
         ("rpm;Nm;eta\n955;2,5;0,4\n1.194;2,5;0,4\n", (), "'1.194' has a point, in a table of decimal commas"),
         ("T,1,2,3\n-5,0.1,0.2,0.3\n", (), "speed -5 is out of range (taken for a matrix"),
+        ("T,1,2,3\n-5,0.1,0.2,0.3\n", (), "allowed: >= 0, or --down torque; for a list three columns: speed, torque, value (--layout list)"),
         ("T,1,2,3\n-5,0.1,0.2,0.3\n", ("--layout", "matrix"), "allowed: >= 0, or --down torque"),
+        ("torque_knm\\speed_rpm,1,2,3\n5,0.1,0.2,0.3\n", (), "'torque_knm\\\\speed_rpm': torques in another unit"),
         ("PK\x03\x04 no table at all\n", (), "holds no numbers; allowed: a text table"),
     ],
 )
