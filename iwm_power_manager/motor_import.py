@@ -17,7 +17,7 @@ _SPEED_NAMES = {"rpm": r"\brpm|1/min|min-1|min\^-1|u/min", "rad/s": r"rad ?/?s\b
 _NOTHING = ("", "nan", "-", "n/a", "na", "null", "none", "inf", "n.a.", "k.a.")
 #: Units that are not read, by what the option that settles it is.
 _OTHER_UNITS = {
-    "speeds": (r"km[/ ]?h\b|\bkph|\bmph|\bm/s|\bkrpm|\brps|\b1/s|\bs\^?-1|\bhz\b|(deg|°)/s", "rad/s or rpm: --speed-unit"),
+    "speeds": (r"km[/ ]?h\b|\b[km]ph|\bm/s|\bkrpm|\brps|\b1/s|\bs\^?-1|\bhz\b|(deg|°)/s", "rad/s or rpm: --speed-unit"),
     "torques": (r"\b[km]n[ ·*]?m\b|\blbf?|\bft\b|\boz", "N m"),
     "losses": (r"\b[km]w\b", "W"),
 }
@@ -143,7 +143,7 @@ def _speed_unit(path: Path | str, header: list[str], chosen: str, said: list[str
 
 
 def _torque_first(head: str) -> bool:
-    """Whether the corner of a matrix names torques before speeds, as torque\\speed: what goes down, what across."""
+    """Whether the corner of a matrix names torques before speeds, as "torque, speed": what goes down, what across."""
     torque, speed = _TORQUE.search(head), _SPEED.search(head)
     return torque is not None and speed is not None and torque.start() < speed.start()
 

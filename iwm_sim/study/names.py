@@ -8,6 +8,9 @@ import os
 #: Every saving is against this one.
 REFERENCE = "equal"
 
+#: The package's own folder of policies.
+DEFAULT_POLICY = "policies"
+
 #: Grid of a policy that is solved because none was found.
 DEFAULT_GRID = "coupled"
 

@@ -20,7 +20,7 @@ from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import grid_path, solve_one
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.study.cases import policy_of
-from iwm_sim.study.names import DEFAULT_GRID
+from iwm_sim.study.names import DEFAULT_GRID, DEFAULT_POLICY
 
 #: Cycles a policy learns its demand from, as in the paper. UDDS is a part of FTP-75.
 TRAINING_CYCLES = tuple(f"config/cycles/{name}.csv" for name in ("ftp75", "hwfet", "nycc"))
@@ -33,7 +33,8 @@ class PolicySource:
     ----------
     path : folder (searched with its subfolders) or policy file
     grid : of the policies that count; "" takes any of a folder's, and solves a missing one on `DEFAULT_GRID`
-    may_solve : False makes a missing policy an error
+    may_solve : False makes a missing policy an error; of a place that is not the package's own it is one anyway, since
+        whoever names a place wants what is in it
     say : told, in one line, of everything that is solved
     """
 
@@ -43,15 +44,15 @@ class PolicySource:
         self._path = resolve(path)
         self._given = path
         self._grid = grid
-        self._may_solve = may_solve
+        self._may_solve = may_solve and path == DEFAULT_POLICY
         self._say = say
         self._bank: dict[str, Policy] | None = None
 
     def find(self, vehicle: Vehicle, friction: float) -> str:
         """File of the policy for a car on a road: that for the nearest friction, as the power manager chooses it.
 
-        A file that was named has to fit. Of a folder, the policies for other cars do not count, and where none is left
-        one is solved for exactly this friction.
+        A file that was named has to fit. Of a folder, the policies for other cars do not count; where none is left in
+        the package's own, one is solved for exactly this friction.
 
         Raises
         ------
@@ -75,7 +76,9 @@ class PolicySource:
         on_grid = f" on grid {self._grid}" if self._grid else ""
         problem = f"{self._given}: holds no policy for '{vehicle.name}' with idle_drive {vehicle.idle_drive}{on_grid}"
         if not self._may_solve:
-            raise PolicyError(f"{problem}; solve one with solve_policy")
+            held = ", ".join(sorted({p.idle_drive for p in bank.values() if p.vehicle_name == vehicle.name}))
+            held = f" (it has some with idle_drive {held})" if held not in ("", vehicle.idle_drive) else ""
+            raise PolicyError(f"{problem}{held}; solve one with solve_policy")
         return solved(vehicle, friction, self._grid or DEFAULT_GRID, self._say, because=problem)
 
     def _is_on_grid(self, policy: Policy) -> bool:

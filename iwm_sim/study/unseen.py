@@ -20,7 +20,7 @@ from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.study import generate
 from iwm_sim.study.cases import drawn_car, vehicle_of
 from iwm_sim.study.frontier import COUNTS, Frontier, Place, margin, measure_frontier
-from iwm_sim.study.names import DEFAULT_GRID
+from iwm_sim.study.names import DEFAULT_GRID, DEFAULT_POLICY
 from iwm_sim.study.policies import PolicySource, solved
 from iwm_sim.study.report import Column
 from iwm_sim.study.tables import plain_table
@@ -85,7 +85,7 @@ def place_of(cell: Cell) -> Place:
 def drive_cell(cell: Cell) -> Frontier:
     """The rivals, and ours at the default budget, on one cell."""
     place = place_of(cell)
-    policy = load_policy(PolicySource("policies", DEFAULT_GRID).find(place.vehicle, cell.friction))
+    policy = load_policy(PolicySource(DEFAULT_POLICY, DEFAULT_GRID).find(place.vehicle, cell.friction))
     return measure_frontier(place, [policy])
 
 

@@ -16,7 +16,7 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.tools.command import described, ended, picture
 from iwm_power_manager.tools.options import add_setting, number, several, whole
-from iwm_sim.study.names import DEFAULT_GRID, FIGURES, MAX_DT_S, NO_RESULTS, REFERENCE, TABLES, cores
+from iwm_sim.study.names import DEFAULT_GRID, DEFAULT_POLICY, FIGURES, MAX_DT_S, NO_RESULTS, REFERENCE, TABLES, cores
 from iwm_sim.study.variants import VARIANTS
 
 DEFAULT_VEHICLE = "config/vehicles/jalalmaab_2015.yaml"
@@ -122,10 +122,10 @@ def _add_cases(group: argparse._ArgumentGroup) -> None:
 def _add_policies(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--policy",
-        default="policies",
+        default=DEFAULT_POLICY,
         metavar="DIR|FILE",
         help="policy file, or folder of them; of a folder, the one for this car and the nearest friction is taken. "
-        "What a folder lacks is solved and kept in the user's cache (default: policies)",
+        "What the package's own folder lacks is solved and kept in the user's cache (default: policies)",
     )
     group.add_argument(
         "--grid",
