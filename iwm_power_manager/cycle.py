@@ -170,7 +170,7 @@ def _header(path: Path | str, number: int, header: list[str]) -> list[str]:
         raise ConfigError(path, where, problem, allowed)
     for name in _REQUIRED:
         if name not in header:
-            raise ConfigError(path, where, f"column '{name}' is missing", allowed)
+            raise ConfigError(path, where, f"column '{name}' is missing: import_cycle reads a log", allowed)
     for name in header:
         if name not in (*_REQUIRED, "grade") or header.count(name) > 1:
             problem = "stands twice" if header.count(name) > 1 else "is unknown"

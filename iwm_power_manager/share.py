@@ -86,6 +86,7 @@ def resolve(path: Path | str) -> Path:
 def did_you_mean(given: Path, known: Iterable[str] = ()) -> str:
     """Question that names up to three of `known`, and of what stands beside `given`, spelled much like it; or "".
 
+    A file is answered with files of its kind, as far as there are any.
     Where a folder above `given` is missing, its name may be the one that is misspelled.
     """
     folder = next((folder for folder in reversed(given.parents) if not os.path.exists(folder)), given)
@@ -93,12 +94,19 @@ def did_you_mean(given: Path, known: Iterable[str] = ()) -> str:
     with contextlib.suppress(OSError):
         names |= {path.name for path in folder.parent.iterdir()}
     names.discard(given.name)  # there, but a link to nowhere
+    if folder == given and given.suffix:
+        kind = [name for name in names if _kind(Path(name)) == _kind(given)]
+        names = set(kind) or names
     by_stem = {Path(name).stem: name for name in sorted(names)}
     near = errors.spelled_like(folder.stem, by_stem)
     if folder != given:
         meant = [folder.with_name(by_stem[stem]) / given.relative_to(folder) for stem in near]
         return errors.did_you_mean(str(path) for path in meant if os.path.exists(path))
     return errors.did_you_mean(str(given.with_name(by_stem[stem] if given.suffix else stem)) for stem in near)
+
+
+def _kind(path: Path) -> str:
+    return path.suffix.lower().replace(".yml", ".yaml")
 
 
 def _files(root: Path) -> list[Path]:

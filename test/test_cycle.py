@@ -65,6 +65,7 @@ def test_windows_line_ends_and_a_byte_order_mark_are_read(write):
         ("time_s,speed_mps\n", "has 0 row(s)"),
         ("time_s,speed_mps\n0,1\n", "has 1 row(s)"),
         ("0,1\n1,2\n", "column 'time_s' is missing"),
+        ("unix_time,km/h\n0,1\n", "column 'time_s' is missing: import_cycle reads a log; allowed: time_s,speed_mps"),
         ("time_s\n0\n1\n", "line 1: column 'speed_mps' is missing"),
         ("time_s,speed_mps,slope\n0,1,0\n1,1,0\n", "column 'slope' is unknown; allowed: time_s,speed_mps[,grade]"),
         ("time_s,speed_mps,time_s\n0,1,0\n1,1,1\n", "column 'time_s' stands twice"),

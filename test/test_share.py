@@ -109,7 +109,8 @@ def test_a_link_to_nowhere_is_not_answered_with_its_own_name(tmp_path: Path) -> 
 
 
 def test_a_file_that_is_not_there_is_answered_with_its_neighbours_of_nearly_that_name(tmp_path: Path) -> None:
-    (tmp_path / "my_van.yaml").touch()
+    for neighbour in ("my_van.yaml", "my_van1.log", "my_van2.log", "my_vann"):
+        (tmp_path / neighbour).touch()
     with pytest.raises(ConfigError, match=rf"No such file or directory; did you mean {tmp_path}/my_van\.yaml\?$"):
         read_bytes(tmp_path / "my_vann.yaml")
     with pytest.raises(ConfigError, match=r"No such file or directory$"):

@@ -18,8 +18,9 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32, Float64
 
+from iwm_power_manager.errors import IwmError
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
-from iwm_power_manager.share import share_path
+from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 
 PERIOD_S = 0.01
@@ -31,12 +32,15 @@ JOINTS = ["wheel_fl_joint", "wheel_fr_joint", "wheel_rl_joint", "wheel_rr_joint"
 def main() -> int:
     """Drive; exit code 1 if the car did not get going or did not stop."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--vehicle", default=share_path("config/vehicles/jalalmaab_2015.yaml"), help="YAML of the car")
+    parser.add_argument("--vehicle", default="jalalmaab_2015", help="YAML of the car, or its name in the package")
     parser.add_argument("--pedal", type=float, default=30.0, help="of either pedal, %%")
     parser.add_argument("--target", type=float, default=3.0, help="speed at which it starts to brake, m/s")
     parser.add_argument("--seconds", type=float, default=60.0, help="patience for all of it")
     options = parser.parse_args(remove_ros_args(sys.argv)[1:])
-    car = load_vehicle(options.vehicle).params
+    try:
+        car = load_vehicle(resolve(options.vehicle)).params
+    except IwmError as error:
+        parser.error(str(error))
     radii_m = [axle.wheel.radius_m for axle in (car.front, car.front, car.rear, car.rear)]
     rclpy.init()
     node = rclpy.create_node("car")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import sys
 import time
@@ -35,6 +36,8 @@ from iwm_power_manager.tools.command import described, ended, made_with
 from iwm_power_manager.tools.options import number, whole
 from iwm_power_manager.tools.progress import Bar
 
+#: A mean of the steps that is so near to the period is the period.
+_STEADY = 0.005
 _DESCRIPTION = """\
 Run the control law over a recorded drive, without DDS and without a clock: the same bag gives the same bytes every
 time. Any rosbag2 recording will do, MCAP or sqlite3; other cars' topics and units are mapped by a YAML file.
@@ -214,8 +217,11 @@ def _made_with(rows: Sequence[Consumption], plans: Sequence[tuple[str, Plan]]) -
         low, high = (f"{value:.3g}" for value in by_label[label].friction)
         friction = low if low == high else f"{low}..{high}"
         period_s = plan.settings.decision_period_s
-        how = (plan.vehicle.idle_drive, 1.0 / by_label[label].step_s, period_s, plan.policies.used)
-        found.setdefault(made_with(friction, *how), []).append(label)
+        step_s = by_label[label].step_s
+        made = made_with(friction, plan.vehicle.idle_drive, 1.0 / step_s, period_s, plan.policies.used)
+        if not math.isclose(step_s, plan.period_s, rel_tol=_STEADY):
+            made += "; the rate is the mean of the recorded steps"
+        found.setdefault(made, []).append(label)
     return [f"{', '.join(labels)}: {text}" for text, labels in found.items()]
 
 

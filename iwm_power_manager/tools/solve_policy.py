@@ -354,7 +354,7 @@ def _convergence_text(result: Solved) -> str:
         for i in policy.iterations
     ]
     if policy.trials:
-        lines.append("price of a change, J: changes a minute")
+        lines.append(f"price of a change, J: changes a minute; {policy.problem.switching_cost_j:.4g} J is taken")
         lines.append("  " + "".join(f"{t.price_j:.4g}: {t.changes_per_min:<8.3g}" for t in policy.trials).rstrip())
     if policy.residual_j is not None:
         lines.append(f"verified: Bellman residual {policy.residual_j:.2g} J, proves {policy.proven_j:.2g} J")

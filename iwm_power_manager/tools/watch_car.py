@@ -38,6 +38,10 @@ _NAN = float("nan")
 _TEMPLATE = """\
 {% block preamble %}<meta name="viewport" content="width=device-width, initial-scale=1">{% endblock %}
 """
+_NO_BOKEH = (
+    "watch_car: the page needs the package bokeh: in a checkout `make setup`, with ROS the rosdep key "
+    "python3-bokeh-pip, else pip install bokeh; --terminal needs none"
+)
 #: Without a step for so long, it is said.
 QUIET_S = 1.0
 LEVELS = ("ok", "warn", "error", "stale")
@@ -407,7 +411,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(own)
     parser.check(options, dict.fromkeys(("--port", "--no-browser"), (not options.terminal, "--terminal has no page")))
     if not options.terminal and importlib.util.find_spec("bokeh") is None:
-        print("watch_car: needs the package bokeh (python3-bokeh-pip, or pip install bokeh)", file=sys.stderr)
+        print(_NO_BOKEH, file=sys.stderr)
         return FAILED
     from iwm_power_manager.ros import ending
 

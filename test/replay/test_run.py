@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -497,20 +498,24 @@ def test_another_cars_bag_is_replayed_through_a_mapping(tmp_path: Path, capsys: 
     assert main([str(tmp_path / "out"), "--compare"]) == DONE  # its own state repeats it exactly
 
 
-def test_a_pause_in_the_inputs_starts_the_law_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def _write_inputs(path: Path, times_ns: Sequence[int]) -> None:
+    """A bag of inputs alone, at these times."""
     script = ScriptedDrive(STRATEGY)
-    with BagWriter(tmp_path / "bag") as bag:
+    with BagWriter(path) as bag:
         from bags_helpers import joint_state_writer
 
         speed, demand = bag.add_topic(topic("/vehicle_speed", TWIST)), bag.add_topic(topic("/power_demand"))
         wheels = bag.add_topic(topic("/wheel_states", "sensor_msgs/msg/JointState"))
         encode = joint_state_writer(("front_left", "front_right", "rear_left", "rear_right"), "velocity")
-        for i in range(60):
-            now = i * 10_000_000 + (5_000_000_000 if i >= 30 else 0)
+        for i, now in enumerate(times_ns):
             metres, radps, watts = script.inputs(i)
             bag.write(speed, now, twist(now, metres))
             bag.write(demand, now + 1, float64(watts))
             bag.write(wheels, now + 2, encode(now, radps))
+
+
+def test_a_pause_in_the_inputs_starts_the_law_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _write_inputs(tmp_path / "bag", [i * 10_000_000 + (5_000_000_000 if i >= 30 else 0) for i in range(60)])
     assert main([str(tmp_path / "bag"), "--strategy", "equal", "--json", "-"]) == DONE
     report = result(capsys)
     assert report["restarts"] == 1
@@ -536,6 +541,13 @@ def test_what_if_says_what_it_was_made_with(drive: Path, capsys: pytest.CaptureF
     made = "friction 0.5, idle drive drag, control at 100 Hz, split decided every 0.02 s"
     assert lines[0] == f"  equal: {made}"
     assert re.fullmatch(rf"  sdp: {made}, policy coupled [0-9a-f]{{8}}", lines[1])
+
+
+def test_a_rate_that_is_not_the_nodes_is_called_a_mean(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _write_inputs(tmp_path / "bag", [i * 10_000_000 for i in range(60) if i % 3])
+    assert main([str(tmp_path / "bag"), "--what-if", "jalalmaab_2015", "--strategy", "equal"]) == DONE
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if "control at" in line)
+    assert line.endswith("; the rate is the mean of the recorded steps")
 
 
 def test_energy_of_a_constant_step_is_power_times_time(drive: Path) -> None:

@@ -64,3 +64,18 @@ def test_a_car_in_rclpy_drives_and_stops(tmp_path: Path, compiled_law: None) -> 
     finally:
         running.process.kill()
         running.process.wait()
+
+
+def test_a_car_that_is_nowhere_is_one_line(tmp_path: Path) -> None:
+    car = subprocess.run(
+        [sys.executable, EXAMPLES / "rclpy_car" / "car.py", "--vehicle", "compact_two_motor"],
+        env=environment(DOMAIN, tmp_path),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert car.returncode == 2
+    assert "error: compact_two_motor: cannot be read" in car.stderr
+    assert "did you mean compact_two_motors" in car.stderr
+    assert "Traceback" not in car.stderr

@@ -52,13 +52,14 @@ def _solve(grid, *arguments, vehicle="jalalmaab_2015", cycle="nycc"):
     return _run("--vehicle", vehicle, "--cycle", cycle, "--grid", grid, *arguments)
 
 
-def test_the_exported_problem_has_the_price_that_was_found_for_a_budget(tmp_path):
+def test_the_exported_problem_has_the_price_that_was_found_for_a_budget(tmp_path, capsys):
     budget = tmp_path / "budget.yaml"
     budget.write_text(GRID.replace("switching_cost_j: 20", "changes_per_min: 4"))
     output, exported = tmp_path / "policy.npz", tmp_path / "mdp.npz"
-    assert _solve(str(budget), "--friction", 0.9, "--output", output, "--export-mdp", exported, "--quiet") == 0
+    assert _solve(str(budget), "--friction", 0.9, "--output", output, "--export-mdp", exported) == 0
     price = load_policy(output).problem.switching_cost_j
     assert price > 0.0
+    assert f"price of a change, J: changes a minute; {price:.4g} J is taken\n" in capsys.readouterr().out
     with np.load(exported) as data:
         assert data["switching_j"].max() >= price  # J, from one end of the shares to the other
         assert np.all(np.diag(data["switching_j"]) == 0.0)

@@ -110,6 +110,17 @@ def test_every_line_of_the_charts_is_a_signal_of_the_state() -> None:
     assert {line.signal for chart in CHARTS for line in chart.lines} <= set(SIGNAL_NAMES)
 
 
+def test_without_bokeh_each_way_to_it_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    assert watch_car.main([]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    for way in ("make setup", "python3-bokeh-pip", "pip install bokeh", "--terminal"):
+        assert way in said
+
+
 def test_a_port_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("bokeh")
     monkeypatch.setattr(watch_car, "listen", lambda *_: (_Nothing(), _Nothing(), _Nothing()))
