@@ -139,8 +139,12 @@ class Tally:
         """What was wrong with the last message, in words; "" if nothing was."""
         if self.violation is Violation.NONE:
             return ""
-        more = self.describe() if self.violation in (Violation.OUT_OF_RANGE, Violation.NOT_FINITE) else ""
+        more = self.described()
         return self.violation.name.lower().replace("_", " ") + (f": {more}" if more else "")
+
+    def described(self) -> str:
+        """What there is to say of the last message, where it was out of range or not finite."""
+        return self.describe() if self.violation in (Violation.OUT_OF_RANGE, Violation.NOT_FINITE) else ""
 
     def age_s(self, now_ns: int) -> float:
         """Time since the last accepted message; infinite before the first."""

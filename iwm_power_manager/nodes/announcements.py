@@ -194,11 +194,12 @@ class Announcements:
             silent = tuple(topic for topic in found if topic in trouble) or self._silent(found, now_ns)
             reason = "; ".join(dict.fromkeys(trouble[topic] for topic in silent if topic in trouble))
             if not reason and tally.why():
-                reason = f"{sum(tally.dropped.values())} messages refused, {tally.why()}"
+                reason = f"{tally.dropped[tally.violation]} messages refused, {tally.why()}"
+                found = () if tally.described() else found  # which says on what topic
             elif not reason and tally.received:
                 age_s = tally.age_s(now_ns)
                 reason = "none since it started over" if math.isinf(age_s) else f"none for {age_s:.2f} s"
-            where = ", ".join(topic for topic in silent or found if topic != name)
+            where = ", ".join(topic for topic in found and (silent or found) if topic != name)
             parts.append(f"{name}" + (f" on {where}" if where else "") + (f" ({reason})" if reason else ""))
         return ", ".join(parts)
 

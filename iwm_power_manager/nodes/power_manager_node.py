@@ -324,7 +324,8 @@ class PowerManager(Starting):
         if self._demand_log:
             self._demand_log.note(taken.stamp_ns, taken.step.values)
         elapsed_s = time.perf_counter() - started_s
-        self._report.note_step(taken.step.command, supervision.motor_factor, taken.since_s, elapsed_s)
+        asked_w = self._controller.monitor.demand_w
+        self._report.note_step(taken.step.command, supervision.motor_factor, asked_w, taken.since_s, elapsed_s)
 
     # Parameters
 

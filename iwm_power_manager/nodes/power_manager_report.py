@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,11 +12,34 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from iwm_power_manager.control.controller import Controller
 from iwm_power_manager.control.supervision import Supervision, binding_limits
-from iwm_power_manager.control.types import GATE_NONE, Command
+from iwm_power_manager.control.types import GATE_NONE, LIMIT_BATTERY_DISCHARGE, LIMIT_SLEW, Command
 from iwm_power_manager.ros import diagnostics
 
-#: Fewer steps since the last report do not say whether a sensor is believed.
+#: Fewer steps since the last report say neither whether a sensor is believed nor whether torque is cut for long.
 _FEW_STEPS = 5
+#: Driving power that is asked for in earnest; the part of it that is as good as none; the part of steps that counts.
+_ASKED_W, _NONE, _MOSTLY = 1e3, 0.05, 0.9
+
+
+def is_cut(command: Command, motor_factor: float, asked_w: float) -> bool:
+    """Whether power to drive is asked for and as good as none is given, although no input is missing."""
+    given_w = command.front_power_w + command.rear_power_w
+    return motor_factor == 1.0 and asked_w > _ASKED_W and abs(given_w) < _NONE * asked_w
+
+
+def cut_in_words(controller: Controller) -> str:
+    """What is asked for and which limits leave nothing of it; "" if none is known."""
+    command, monitor = controller.command, controller.monitor
+    if command is None or not (bits := command.limits & ~LIMIT_SLEW):
+        return ""
+    why = f"at {command.speed_mps:.3g} m/s"
+    if bits & LIMIT_BATTERY_DISCHARGE:  # the last of them: before it, something was left
+        bits = LIMIT_BATTERY_DISCHARGE
+        why = f"charge {100.0 * monitor.soc:.3g} %"
+        why += "" if math.isnan(monitor.temperature_c) else f", {monitor.temperature_c:.3g} degC"
+        why += ": right unit?"
+    limits = ", ".join(binding_limits(bits, 1.0))
+    return f"asked for {monitor.demand_w / 1e3:.3g} kW, gets as good as none: {limits} ({why})"
 
 
 class PowerManagerReport:
@@ -29,7 +53,7 @@ class PowerManagerReport:
 
     Attributes
     ----------
-    doubts : what the last report said of sensors that are not believed, for the log
+    doubts : what the last report said of sensors that are not believed and of torque that is cut, for the log
     """
 
     def __init__(
@@ -44,12 +68,17 @@ class PowerManagerReport:
         self._activity: Counter[str] = Counter()
         self._steps = 0
         self._doubted: Counter[int] = Counter()
+        self._cut_steps = 0
+        self._cut = ""
         self.doubts: list[str] = []
 
-    def note_step(self, command: Command, motor_factor: float, period_s: float | None, execution_s: float) -> None:
+    def note_step(
+        self, command: Command, motor_factor: float, asked_w: float, period_s: float | None, execution_s: float
+    ) -> None:
         """Count one step of the active node."""
         self._loop.add(period_s, execution_s)
         self._steps += 1
+        self._cut_steps += is_cut(command, motor_factor, asked_w)
         self._doubted.update(number for number in range(5) if command.doubted & 1 << number)
         if command.gate != GATE_NONE:
             self._activity["gate"] += 1
@@ -76,6 +105,8 @@ class PowerManagerReport:
         """
         statuses: list[diagnostics.Status] = []
         command = controller.command if controller else None
+        if controller and self._steps >= _FEW_STEPS:  # the same words as long as it lasts
+            self._cut = (self._cut or cut_in_words(controller)) if self._cut_steps > _MOSTLY * self._steps else ""
         statuses.append(
             diagnostics.control_status(
                 lifecycle,
@@ -85,6 +116,7 @@ class PowerManagerReport:
                 self._activity,
                 values["strategy"],
                 self._car,
+                self._cut,
             )
         )
         if lifecycle == "active" and controller:
@@ -101,13 +133,14 @@ class PowerManagerReport:
             sensors = diagnostics.sensors_status(self._doubted, self._steps, self._wheel_names, agree=agree)
             if self._steps >= _FEW_STEPS:
                 self.doubts = [sensors.message] if sensors.level != diagnostics.OK else []
+                self.doubts += [self._cut] if self._cut else []
             statuses.append(sensors)
             statuses.append(diagnostics.motors_status(controller.actuators, self._wheel_names))
             statuses.append(diagnostics.brakes_status(controller.brake_gain, self._wheel_names))
             statuses.append(self._loop.report(self._rate_hz, values))
         self._activity.clear()
         self._doubted.clear()
-        self._steps = 0
+        self._steps = self._cut_steps = 0
         return diagnostics.to_message(now_ns, self._node_name, [*statuses, *extra])
 
 

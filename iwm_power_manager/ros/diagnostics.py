@@ -187,8 +187,12 @@ def control_status(
     activity: Mapping[str, int],
     strategy: str,
     car: Mapping[str, str],
+    cut: str = "",
 ) -> Status:
-    """What the control does: lifecycle state, mode and its reason, gate, limits and how often they bind; the car."""
+    """What the control does: lifecycle state, mode and its reason, gate, limits and how often they bind; the car.
+
+    With `cut`, limits leave nothing of what is asked for.
+    """
     mode = MODE_NAMES[supervision.mode]
     missing = [name for bit, name in STALE_NAMES.items() if supervision.stale & bit]
     values = {
@@ -205,7 +209,7 @@ def control_status(
     if lifecycle != "active":
         return Status("control", OK, lifecycle, values)
     if supervision.mode == MODE_NORMAL:
-        return Status("control", OK, "normal", values)
+        return Status("control", WARN if cut else OK, cut or "normal", values)
     reason = f": {', '.join(missing)} missing" if missing else ""
     return Status("control", ERROR if missing else WARN, f"{mode}{reason}", values)
 

@@ -146,6 +146,7 @@ class Assembly:
     Attributes
     ----------
     battery : last value of each of `mapping.BATTERY`, NaN before the first
+    sources : of each signal that is mapped
     """
 
     def __init__(
@@ -157,6 +158,7 @@ class Assembly:
         self.wheel_names = tuple(wheel_names)
         self.vehicle = vehicle
         self.battery = dict.fromkeys(BATTERY, _NAN)
+        self.sources: Mapping[str, Sequence[Source]] = {}
         self.speed_read_mps = 0.0
         self._speed_mps = speed_mps or (lambda: self.speed_read_mps)
         self._wanted = "power_demand", _NAN, _NAN
@@ -164,9 +166,10 @@ class Assembly:
         self._wheels = {signal: [_NAN] * WHEELS for signal in _JOINTS}
         self._came = {signal: [0] * WHEELS for signal in _JOINTS}
 
-    def expect_pedals(self, signals: Iterable[str]) -> None:
-        """These are mapped: without one of them there is no demand but to brake."""
-        self._pedals |= {signal: (_NEVER_NS, 0.0) for signal in PEDALS if signal in signals}
+    def expect(self, sources: Mapping[str, Sequence[Source]]) -> None:
+        """These are mapped: without one of the pedals among them there is no demand but to brake."""
+        self.sources = sources
+        self._pedals |= {signal: (_NEVER_NS, 0.0) for signal in PEDALS if signal in sources}
 
     def demand(self, signal: str, time_ns: int, value: float) -> tuple[DemandReading, ...]:
         """A demand in its own unit as power at the present speed; nothing as long as a pedal has never come."""
@@ -191,8 +194,8 @@ class Assembly:
             signal, value, oldest_ns = PEDALS[1], brake, brake_ns
         elif oldest_ns == _NEVER_NS or max(times_ns) - time_ns > _AHEAD_NS:
             return ()
-        elif not math.isfinite(_way(accelerator)):
-            signal, value = PEDALS[0], accelerator
+        else:
+            signal, value = (PEDALS[1], brake) if math.isnan(travel) else (PEDALS[0], accelerator)
         power_w = _NAN
         if not math.isnan(travel):
             power_w = float(
@@ -202,11 +205,19 @@ class Assembly:
         return (DemandReading(time_ns, power_w, max(time_ns - oldest_ns, 0) / _NS_PER_S),)
 
     def wanted_in_words(self) -> str:
-        """The last demand as it was said, and the power it became."""
+        """The last demand as it was said, in the unit of the file, on which topic, and the power it became."""
         signal, value, power_w = self._wanted
+        name, unit = next(iter(UNITS[signal].items()))
+        where = ""
+        for source in self.sources.get(signal, ()):
+            name, unit = next((found, unit) for found, unit in UNITS[signal].items() if unit == source.unit)
+            where = f" on {source.topic}"
+        symbol = "" if name == "1" else f" {name}"
         power = f", which is {power_w:g} W" if signal != "power_demand" and math.isfinite(power_w) else ""
-        way = "; a pedal's way is 0 to 1: right unit?" if signal in PEDALS and math.isinf(_way(value)) else ""
-        return f"{signal} {value:g} {next(iter(UNITS[signal]))}{power}{way}"
+        way = ""
+        if signal in PEDALS and math.isinf(_way(value)):
+            way = f"; a pedal's way is 0 to {1.0 / unit.factor:g}{symbol}: right unit?"
+        return f"{signal} {value / unit.factor:g}{symbol}{where}{power}{way}"
 
     def warm(self, signals: Iterable[str]) -> None:
         """Compile what the conversion of these signals needs, or read it from the cache."""
@@ -278,7 +289,7 @@ def topic_readers(
     ConfigError
         A field does not exist in the type of its topic, or is no number; names the key.
     """
-    assembly.expect_pedals(mapping.sources)
+    assembly.expect(mapping.sources)
     by_topic: dict[str, list[tuple[str, int, Source]]] = defaultdict(list)
     for signal in sorted(mapping.sources, key=SIGNALS.index):  # the speed before what is judged or converted by it
         sources = mapping.sources[signal]

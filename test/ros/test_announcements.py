@@ -106,3 +106,22 @@ def test_of_two_pedals_the_log_names_the_silent_one(log: Log) -> None:
     heard_ns = {"/accelerator": 990_000_000, "/brake": 960_000_000}
     says.stepped(controller, {DEMAND: tuple(heard_ns)}, {}, (), 1_000_000_000, heard_ns)
     assert log.lines[-1] == "degraded, motor torque fades: power_demand on /brake (none for 0.04 s)"
+
+
+def test_refused_messages_are_counted_by_their_reason_and_a_described_one_names_its_topic_itself(log: Log) -> None:
+    says = Announcements(log)
+    says.prepared(prepared(1.0, 0))
+    tallies = {name: Tally() for name in STALE_NAMES.values()}
+    tallies[DEMAND].describe = lambda: "accelerator_pedal 300 % on accelerator; allowed: 0 to 100"
+    for violation in (Violation.LATE, Violation.LATE, Violation.NOT_FINITE, Violation.OUT_OF_RANGE):
+        tallies[DEMAND].note(violation, 0)
+    controller: Any = SimpleNamespace(
+        supervision=Supervision(mode=MODE_DEGRADED, stale=STALE_DEMAND),
+        monitor=SimpleNamespace(tallies=tallies),
+        command=None,
+    )
+    says.stepped(controller, {DEMAND: ("/accelerator", "/brake")}, {}, (), 0, {})
+    assert log.lines[-1] == (
+        "degraded, motor torque fades: power_demand (1 messages refused, "
+        "out of range: accelerator_pedal 300 % on accelerator; allowed: 0 to 100)"
+    )

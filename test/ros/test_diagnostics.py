@@ -143,6 +143,11 @@ class TestControl:
         assert status.values["degraded reason"] == "none"
         assert status.values["vehicle"] == "van"
 
+    def test_a_demand_of_which_limits_leave_nothing_is_a_warning(self) -> None:
+        normal = Supervision(MODE_NORMAL, 0, 1.0, 1.0, 1.0)
+        status = control_status("active", normal, 0, 4, {}, "sdp", CAR, "asked for 20 kW, gets as good as none")
+        assert (status.level, status.message) == (WARN, "asked for 20 kW, gets as good as none")
+
     def test_a_faded_motor_is_not_put_down_to_the_battery(self) -> None:
         for factor, words in ((0.0, "motor, motors faded out"), (0.5, "motor, battery_discharge")):
             supervision = Supervision(MODE_DEGRADED, STALE_DEMAND, factor, 1.0, 0.0)

@@ -165,7 +165,7 @@ class TestDiagnostics:
         full_name = f"{bench.node.get_namespace()}/power_manager"
         assert {status.name for status in bench.diagnostics[-1].status} == {
             f"{full_name}: {name}"
-            for name in ("control", "inputs", "sensors", "motors", "control loop", "policy", "command topics")
+            for name in ("control", "inputs", "sensors", "motors", "brakes", "control loop", "policy", "command topics")
         }
         assert {status.hardware_id for status in bench.diagnostics[-1].status} == {full_name}
         for name in ("control", "inputs", "policy", "command topics"):
@@ -271,6 +271,23 @@ def test_inputs_that_come_too_slowly_are_named_with_their_rate(start_own) -> Non
         bench.drive(lambda found=found: re.search(found, pair.running.text()), found, period_s=0.08)
     said = bench.drive(lambda: bench.status("input topics"), "the rate in the diagnostics", period_s=0.08).message
     assert re.search(f"/vehicle_speed: {comes}", said)
+
+
+def test_power_that_a_limit_leaves_nothing_of_is_named_with_the_limit(start_own) -> None:
+    """A charge of 0.8 in a unit of % is 0.008: a normal drive otherwise, in which the car never moves."""
+    pair = start_own({"missed_periods": 10, "own_gap_s": 1.0})
+    bench = pair.bench
+    bench.connect()
+    said = "asked for 20 kW, gets as good as none: battery_discharge (charge 0.8 %, 25 degC: right unit?)"
+    empty = {"soc": 0.008, "demand": 20e3, "speed": 0.0}
+    bench.drive(lambda: "WARN" in said_with(pair, said), "the reason in the log", **empty)
+    assert bench.drive(lambda: bench.status("control").message == said, "and in the diagnostics", **empty)
+    bench.drive(lambda: "over: " in said_with(pair, said), "that it is over", demand=0.0, soc=0.008, speed=0.0)
+
+
+def said_with(pair, text: str) -> str:
+    """Lines of the node's log with that text."""
+    return "\n".join(line for line in pair.running.text().splitlines() if text in line)
 
 
 def test_a_rate_is_told_whatever_pause_was_in_between() -> None:

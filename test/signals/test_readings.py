@@ -340,11 +340,36 @@ def test_an_accelerator_far_beyond_its_way_is_no_number_and_the_words_say_so(tmp
     quick["brake"](number(0.0), 1)
     for pedal, value in (("accelerator", travel), ("brake", 0.0)):
         assert math.isinf(quick[pedal](number(value), 1)[0].power_w)
-        assert assembly.wanted_in_words() == f"accelerator_pedal {travel:g} 1; a pedal's way is 0 to 1: right unit?"
+        assert assembly.wanted_in_words() == (
+            f"accelerator_pedal {travel:g} on accelerator; a pedal's way is 0 to 1: right unit?"
+        )
     assert quick["brake"](number(0.5), 1)[0].power_w == -0.5 * full_braking_w(10.0, CAR)
     assert quick["accelerator"](number(1.1), 1)[0].power_w == -0.5 * full_braking_w(10.0, CAR)
     quick["brake"](number(0.0), 1)
     assert quick["accelerator"](number(1.1), 1)[0].power_w == pedal_power_w(1.0, 0.0, 10.0, CAR)
+
+
+@pytest.mark.parametrize(
+    ("accelerator", "brake", "words"),
+    [
+        (100.0, 0.0, "accelerator_pedal 100 % on accelerator, which is "),
+        (math.nan, 0.0, "accelerator_pedal nan % on accelerator"),
+        (100.0, 20.0, "brake_pedal 20 % on brake, which is -"),
+        (100.0, math.nan, "brake_pedal nan % on brake"),
+        (30e2, 0.0, "accelerator_pedal 3000 % on accelerator; a pedal's way is 0 to 100 %: right unit?"),
+    ],
+)
+def test_of_two_pedals_the_words_name_the_one_that_made_the_demand_in_its_own_unit(
+    tmp_path: Path, accelerator: float, brake: float, words: str
+) -> None:
+    path = tmp_path / "signals.yaml"
+    path.write_text(f"signals:\n{PEDALS}".replace('"1"', '"%"'))
+    assembly = Assembly(WHEEL_NAMES, CAR, lambda: 10.0)
+    quick = readers_of(load_mapping(path), assembly)
+    for pedal, value in (("brake", brake), ("accelerator", accelerator), ("brake", brake)):
+        quick[pedal](number(value), 1)
+        said = assembly.wanted_in_words()
+    assert said.startswith(words)
 
 
 def test_a_brake_far_beyond_its_way_brakes_fully_and_one_of_the_wrong_sign_is_refused(tmp_path: Path) -> None:
