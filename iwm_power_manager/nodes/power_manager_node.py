@@ -45,6 +45,7 @@ _WATCHDOG_PERIOD_S = 0.1
 _REPORT_PERIOD_S = 1.0
 #: Diagnostics on change come no faster than this: a gate may open and close at the control rate.
 _CHANGE_PERIOD_S = 0.1
+_STANDS_STILL = "the clock stands still"
 
 
 class PowerManager(Starting):
@@ -394,9 +395,12 @@ class PowerManager(Starting):
             standing_s = time.monotonic() - self._last_step_steady_s
             if stepping and standing_s > self._values["clock_stopped_s"]:
                 stepping = False
-                if not self._fault:
-                    self.get_logger().warning("the clock stands still: zero torque")
-                self._fault = "the clock stands still"
+                if not self.get_clock().ros_time_is_active:
+                    self._says.held_up()
+                    self._fault = "no control step: this process was held up, or the system's clock was set back"
+                elif self._fault != _STANDS_STILL:
+                    self._fault = _STANDS_STILL
+                    self.get_logger().warning(f"{self._fault}: zero torque")
                 self._start_over()
                 assert self._outputs is not None
                 self._outputs.zero(self._now_ns())

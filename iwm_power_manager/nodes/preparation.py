@@ -66,10 +66,11 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
         A file is missing or wrong, or a policy is of another car.
     """
     started_s = time.monotonic()
+    mapping = load_mapping(resolve(values["signals_file"]))  # first: wrong ones are not to wait for compiled code
+    mapping.check_live()
     vehicle = load_vehicle(resolve(values["vehicle_file"]), values["idle_drive"] or None)
     policies = choose_policies(values["policy_file"], values["strategy"], values["fallback"], values["rule"], vehicle)
     names = tuple(values["wheel_names"])
-    mapping = load_mapping(resolve(values["signals_file"]))
     if values["signals_file"] == DEFAULT_MAPPING:
         mapping = mapping.with_wheel_names(names)
     thresholds = for_car(config.thresholds_of(values), vehicle.params)
@@ -102,7 +103,6 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
 def _interface(
     mapping: SignalMapping, controller: Controller, vehicle: Vehicle, values: Mapping[str, Any], demand: ValueLimits
 ) -> tuple[dict[str, TopicReader], dict[str, CommandWriter]]:
-    mapping.check_live()
     demands = {source.topic for signal in (*DEMANDS, *PEDALS) for source in mapping.sources.get(signal, ())}
     if values["lockstep"] and len(demands) > 1:
         problem = "the demand closes a set of inputs in lock-step, and comes on two topics"

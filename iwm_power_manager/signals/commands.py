@@ -7,7 +7,8 @@
       friction_torque: none
 
 A command is one message with an array of four (in a stated order, or by name in a JointState) or four messages with a
-number each. What is sent is torque * factor * sign. `none` leaves the friction brakes to another system.
+number each. What is sent is torque * factor * sign. `none` leaves the friction brakes to another system; with it alone
+in the section, motor torques go to the project's own topic.
 """
 
 from __future__ import annotations
@@ -70,8 +71,12 @@ def read_commands(file: Path, content: Any) -> dict[str, tuple[Sink, ...]]:
     ConfigError
         A key, name, unit or order is wrong.
     """
-    entries = check_keys(file, content, list(COMMANDS), [], "commands")
+    entries = check_keys(file, content, [FRICTION], [MOTOR], "commands")
     found: dict[str, tuple[Sink, ...]] = {}
+    if MOTOR not in entries:
+        if entries[FRICTION] != "none":
+            raise ConfigError(file, dotted("commands", MOTOR), "is missing", "left out only with friction_torque: none")
+        found[MOTOR] = standard()[MOTOR]
     for kind, entry in entries.items():
         key = dotted("commands", kind)
         if kind == FRICTION and entry == "none":

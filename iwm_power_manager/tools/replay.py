@@ -167,6 +167,10 @@ def _replay(bag: BagReader, options: argparse.Namespace) -> int:
     elapsed_s = time.perf_counter() - started_s
     result = _result(bag, plan, report)
     lines = _report_lines(bag, report, elapsed_s)
+    if options.mapping and report.exact:
+        lines.append(
+            f"  of {options.mapping} only the commands count: its inputs are not read where steps are recorded"
+        )
     if writer is not None:
         lines.append(f"written: {writer.path}, {writer.message_count} messages")
     if options.compare:

@@ -246,7 +246,9 @@ def test_a_drive_on_mapped_topics_is_recorded_without_naming_them_and_its_comman
     compared = {row["topic"]: row["compared"] for row in found["comparison"]}
     assert set(compared) == {f"{name}/{topic}" for topic in (*(f"torque_{i}" for i in range(4)), "power_manager/state")}
     assert min(compared.values()) > 50
-    assert f"not compared: friction_torque: goes nowhere ({signals})" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert f"not compared: friction_torque: goes nowhere ({signals})" in text
+    assert f"of {signals} only the commands count" in text
     assert replay([bag, "--compare", "--quiet"]) == 1  # with brakes that were not there
     text = capsys.readouterr().out
     assert f"give the files that the drive was recorded with, or others: --mapping '{signals}'" in text
@@ -301,7 +303,7 @@ def test_what_it_waits_for_names_the_topic_the_reason_and_the_remedy(connect: Ca
     assert remedy + "{type: nav_msgs/msg/Odometry, field: twist.twist.linear.x}" in line
     name = car.stack.node.get_namespace()
     assert f"wheel_states on {name}/rpm_2, {name}/rpm_3 (no message; no publisher)" in line
-    assert "out of range: force_demand 4e+06 N, which is 4e+06 W; allowed: demand_min_w -600000 to" in line
+    assert "out of range: force_demand 4000 kN on force, which is 4e+06 W; allowed: demand_min_w -600000 to" in line
     assert "battery" not in line
 
 

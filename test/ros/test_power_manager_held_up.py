@@ -107,6 +107,7 @@ def run(start_pair, count: int, seed: int) -> list[Hold]:
         del car.motors[:-1], car.brakes[:-1], pair.bench.states[:-1], pair.bench.torques[:-1]
     assert pair.running.process.poll() is None
     assert "this process was held up" in pair.running.text()
+    assert "the clock stands still" not in pair.running.text()  # nobody simulates one
     assert all("(" in line for line in pair.running.text().splitlines() if "waits for" in line)
     return found
 

@@ -34,6 +34,15 @@ def test_without_a_section_the_projects_own_commands_are_sent(tmp_path: Path) ->
     assert tuple(standard()) == COMMANDS
 
 
+def test_without_friction_brakes_alone_the_motors_have_the_projects_own_topic(tmp_path: Path) -> None:
+    path = tmp_path / "signals.yaml"
+    path.write_text(f"{SIGNALS}commands: {{friction_torque: none}}\n")
+    assert load_mapping(path).commands == {MOTOR: standard()[MOTOR], FRICTION: ()}
+    path.write_text(f"{SIGNALS}commands: {{friction_torque: {{}}}}\n")
+    with pytest.raises(ConfigError, match=r"commands\.motor_torque: is missing; allowed: left out only with"):
+        load_mapping(path)
+
+
 @pytest.mark.parametrize("kind", COMMANDS)
 def test_the_standard_command_is_the_joint_state_that_rclpy_writes(kind: str) -> None:
     ((topic, data),) = CommandWriter(FILE, standard()[kind])(5_000_000_007, TORQUES)
