@@ -124,7 +124,7 @@ def _beyond(value: float, limits: Mapping[str, float], what: str, unit: str, tex
     for level, word in ((ERROR, "error"), (WARN, "warn")):
         limit = limits[f"{what}_{word}_{unit}"]
         if value > limit:
-            return [(level, f"{text} {value:.0f} {unit} is above {limit:g}")]
+            return [(level, f"{text} {value:.0f} {unit.replace('hz', 'Hz')} is above {limit:g}")]
     return []
 
 

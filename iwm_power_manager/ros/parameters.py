@@ -57,10 +57,12 @@ def declare(node: Node, specs: Sequence[Spec]) -> dict[str, Any]:
         try:
             value = node.declare_parameter(spec.name, spec.default, descriptor(spec)).value
         except (InvalidParameterTypeException, InvalidParameterValueException, ParameterUninitializedException):
-            given = node._parameter_overrides.get(spec.name)  # the exceptions do not all carry the value
+            override = node._parameter_overrides.get(spec.name)  # the exceptions do not all carry the value
+            given = override.value if override else None
+            whole = type(given) is int and isinstance(spec.default, float)  # ROS takes no 100 for 100.0
             raise ParameterError(
-                f"parameter {spec.name}: {given.value if given else None!r} is not allowed; "
-                f"allowed: {spec.allowed()} ({_type_name(spec)})"
+                f"parameter {spec.name}: {given!r} is not allowed; "
+                f"allowed: {spec.allowed()} ({_type_name(spec)}{f': write {given}.0' if whole else ''})"
             ) from None
         problem = spec.problem(value)
         if problem:

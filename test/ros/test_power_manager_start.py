@@ -37,6 +37,7 @@ def fails_with(folder: Path, args: list[str]) -> str:
         ({"policy_file": "/nowhere/policy.npz"}, "/nowhere/policy.npz: cannot be read"),
         ({"policy_file": ""}, "policy_file: is empty"),
         ({"strategy": "equal", "vehicle_file": "/nowhere/car.yaml"}, "/nowhere/car.yaml: cannot be read"),
+        ({"rate_hz": 100}, "parameter rate_hz: 100 is not allowed; allowed: 10 to 1000 (double: write 100.0)"),
         ({"rate_hz": 1e6}, "parameter rate_hz: 1000000.0 is not allowed; allowed: 10 to 1000"),
         ({"rate_hz": "fast"}, "parameter rate_hz: 'fast' is not allowed; allowed: 10 to 1000"),
         ({"strategy": "clever"}, "parameter strategy: 'clever' is not allowed; allowed: equal | rule"),
