@@ -14,6 +14,7 @@ from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import road_run
+from iwm_sim.closed_loop import RoadRow
 from iwm_sim.drive import Drive
 from iwm_sim.faults import Fault
 from iwm_sim.road_report import text
@@ -105,7 +106,7 @@ def test_a_lost_message_degrades_the_power_manager():
     fault = Fault("vehicle_speed", "lost", 0.0, 0.5, 1.0, message=True)
     run = drive(dataclasses.replace(STOP, demand=(), faults=(fault,), duration_s=2.0))
     assert run.road is not None
-    mode = run.road[:, -2]
+    mode = run.road[:, RoadRow._fields.index("mode")]
     assert set(mode[:50]) == {1.0}
     assert 2.0 in set(mode[55:95])
 
