@@ -18,7 +18,7 @@ import numpy as np
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.settings import Settings, default_settings
-from iwm_power_manager.control.thresholds import Thresholds, actuator_limits, input_limits, supervision_limits
+from iwm_power_manager.control.thresholds import Thresholds, actuator_limits, for_car, input_limits, supervision_limits
 from iwm_power_manager.replay.plan import PolicyBank
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.closed_loop import BATTERY_TEMPERATURE_DEGC, Run, decision_of
@@ -70,7 +70,7 @@ def controller_of(scenario: Scenario, settings: Settings | None = None, policies
     params = vehicle.params
     if scenario.foreign_brakes:
         params = params.with_axles(friction_brake=params.front.friction_brake._replace(max_torque_nm=0.0))
-    thresholds = Thresholds()
+    thresholds = for_car(Thresholds(), params)
     prior = scenario.told_friction
     settings = (settings or default_settings())._replace(friction_prior=prior)
     limits = ControllerLimits(

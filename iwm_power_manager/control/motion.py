@@ -65,11 +65,11 @@ STANDING_MPS = 0.1
 ALONE = 3.0
 #: An accelerometer sides with the speeds where it is this many times nearer to them than to the forces.
 NEARER = 0.5
-#: Deceleration by brakes of another system that a demand explains, as part of it and m/s2.
+#: Deceleration by brakes that are not counted on that a demand explains, as part of it and m/s2.
 ASKED_PART, ASKED_MPS2 = 1.25, 1.0
 #: A brake gives less than half of its torque where no road of this friction would let its wheel slip so little with it;
-#: one that gives less than the second part gives nothing, more than the third is no fault.
-BEST_ROAD, HALF, DEAD, WHOLE = 1.2, 0.5, 0.2, 0.8
+#: one that gives less than the last part gives nothing.
+BEST_ROAD, HALF, DEAD = 1.2, 0.5, 0.2
 #: Nothing accelerates a car more than this, m/s2.
 MOST_MPS2 = 12.0
 #: A sensor must have been near the reference for this long before it is believed again.
@@ -407,13 +407,14 @@ def _voted(
     mean = _middle(rims) if blind else shown
     spread = AGREE_PART * abs(mean) + AGREE_MPS
     count, own_nm = 0, 0.0
-    slipping, foreign = True, _foreign_brakes(vehicle)
+    slipping, foreign, gain = True, _foreign_brakes(vehicle), before.brake_gain
     for i in range(4):
         if abs(rims[i] - mean) <= spread:
             count += 1
             own_nm += torque[i]
         else:
-            braked = foreign and mean * (rims[i] - mean) < 0.0
+            # By a brake that nobody counts on: another system's, or one that is back.
+            braked = (foreign or gain[i] < 1.0) and mean * (rims[i] - mean) < 0.0
             slipping = slipping and (braked or torque[i] * (rims[i] - mean) > 0.0)
     near = abs(mean - predicted) <= SPEED_PART * abs(mean) + SPEED_MPS
     enough = (count == 4 and all_doubted) if blind else slipping
@@ -430,14 +431,16 @@ def _voted(
     # What an accelerometer says, a slope taken off as the forces have it.
     felt = agreed.felt_mps + before.bias_mps2 * agreed.lasted_s
     off_speeds, off_forces = abs(felt - (mean - agreed.from_mps)), abs(felt - agreed.moved_mps)
+    uncounted = (foreign or min(gain) < 1.0) and _asked_for(mean, agreed, measurement, vehicle)
     if count == 0:
-        # No wheel rolls with the sensor: only an accelerometer tells that it is right.
-        return agreed, mean, agreed.lasted_s > ALONE * APART_S and off_speeds < NEARER * off_forces
+        # No wheel rolls with the sensor: only an accelerometer tells that it is right, or brakes that are back.
+        told = off_speeds < NEARER * off_forces or (uncounted and not foreign)
+        return agreed, mean, agreed.lasted_s > ALONE * APART_S and told
     if slip:
         if off_forces < NEARER * off_speeds:
             return agreed, mean, False
-        known = off_speeds < NEARER * off_forces or _others_brake(mean, agreed, measurement, vehicle)
-        slip = not (known or abs(before.bias_mps2) > BIAS_MPS2 or min(before.brake_gain) < 1.0)
+        known = off_speeds < NEARER * off_forces or uncounted
+        slip = not (known or abs(before.bias_mps2) > BIAS_MPS2 or min(gain) < 1.0)
         if slip and count < 4:
             return none, mean, False
     enough_s = AGREED_S if slip else APART_S
@@ -453,11 +456,11 @@ def _foreign_brakes(vehicle: VehicleParams) -> bool:
 
 
 @kernel
-def _others_brake(mean: float, agreed: Agreed, measurement: Measurement, vehicle: VehicleParams) -> bool:
-    """Whether brakes of another system do what the driver asks for."""
+def _asked_for(mean: float, agreed: Agreed, measurement: Measurement, vehicle: VehicleParams) -> bool:
+    """Whether the speeds slow down no more than the driver asks for."""
     asked = -measurement.power_demand_w / (vehicle.chassis.mass_kg * max(abs(mean), SLOW_MPS))
     slower = abs(agreed.from_mps) - abs(mean)
-    return _foreign_brakes(vehicle) and asked > 0.0 and slower <= (ASKED_PART * asked + ASKED_MPS2) * agreed.lasted_s
+    return asked > 0.0 and slower <= (ASKED_PART * asked + ASKED_MPS2) * agreed.lasted_s
 
 
 @kernel
@@ -513,8 +516,6 @@ def _weak_brakes(
     if lack_mps2 <= 0.0 or blamed_n == 0.0:
         return gain, 0.0
     part = max(1.0 - lack_mps2 * mass / blamed_n, 0.0)
-    if part > WHOLE:
-        return gain, 0.0
     if part < DEAD:
         part = 0.0
     all_alike = free_n == 0.0

@@ -188,7 +188,7 @@ def supervision_limits(thresholds: Thresholds) -> SupervisionLimits:
 def for_car(thresholds: Thresholds, vehicle: VehicleParams) -> Thresholds:
     """Thresholds that believe what a car's own pedals ask for, at any speed that is believed.
 
-    A heavy or strong car asks for more than the defaults: a full stop of 2.8 t from 30 m/s for 800 kW.
+    A heavy or strong car asks for more than the defaults: the brake pedal of 2.8 t at 0.8 g and 30 m/s for 660 kW.
     """
     accelerator, brake = (
         _BEYOND_PEDALS * float(demand_power_w(PEDAL_TRAVEL, *travel, thresholds.speed_max_mps, vehicle))

@@ -306,7 +306,9 @@ class Braked(Car):
         shown = tuple(w * (1.0 - slip) for w, slip in zip(self.rim, self.slips, strict=True))
         v = spoil.get("spoil_speed", lambda v: v)(self.v)
         rate = sum(given) / RADIUS / self.mass - resistance(self.v) - self.grade
-        m = Measurement(v, shown, -1e4, DT, 0.9, 1e5, 1e5, 0.5, acceleration_mps2=rate if felt else math.nan)
+        m = Measurement(
+            v, shown, sum(torques) / RADIUS * v, DT, 0.9, 1e5, 1e5, 0.5, acceleration_mps2=rate if felt else math.nan
+        )
         self.motion, after = estimate(m, self.state.motion, self.state.wheels, 1.0, self.state.steps == 0, CAR)
         memory = tuple(
             wheel._replace(total_nm=gain * torque, speed_radps=w)
@@ -341,14 +343,41 @@ def test_brakes_that_are_dead_are_found_and_no_sensor_is_doubted_for_long(dead):
     assert car.state.motion.brake_gain == tuple(0.0 if i in dead else 1.0 for i in range(4))
 
 
-def test_brakes_that_come_back_are_counted_on_again():
-    car = Braked(35.0)
-    told, none = (-500.0,) * 4, (0.0,) * 4
-    for given in (none, (0.0, 0.0, -500.0, -500.0), told):
-        for _ in range(90):
-            motion = car.brake(none if given is none else told, given, slips_of(given))
+@pytest.mark.parametrize("rolls_s", [0.0, 0.3])
+@pytest.mark.parametrize("torque", [-500.0, -900.0])
+def test_brakes_that_come_back_are_counted_on_again(torque, rolls_s):
+    """Found in the same braking, or in the next one: a sensor that is right must not be doubted as long as it lasts."""
+    car = Braked(45.0)
+    told, again, none = (-900.0,) * 4, (torque,) * 4, (0.0,) * 4
+    for given, steps in ((none, 20), ((0.0, 0.0, -900.0, -900.0), 100)):
+        for _ in range(steps):
+            car.brake(none if given is none else told, given, slips_of(given))
+    assert car.state.motion.brake_gain == (0.0, 0.0, 1.0, 1.0)
+    for _ in range(int(rolls_s / DT)):
+        car.brake(none, none)
+    doubted_s = 0.0
+    for _ in range(150):
+        v = car.v
+        motion = car.brake(again, again, slips_of(again))
+        doubted_s += DT * (motion.doubted >= 16)
+    assert doubted_s <= 0.5
     assert motion.doubted == 0
+    assert motion.speed_mps == v
     assert car.state.motion.brake_gain == (1.0,) * 4
+
+
+def test_a_sensor_and_a_single_wheel_that_agree_for_a_quarter_of_a_second_outvote_nothing():
+    car = Braked(30.0)
+    told, none = (-600.0,) * 4, (0.0,) * 4
+    for _ in range(20):
+        car.brake(none, none)
+    for _ in range(60):
+        car.brake(told, told, slips_of(told))
+    for _ in range(26):
+        v = car.v
+        car.slips = (-0.3, *car.slips[1:])
+        motion = car.brake(told, told, (-0.3, 0.1, 0.1, 0.1), spoil_speed=lambda v: 1.3 * v)
+    assert motion.speed_mps == pytest.approx(v, abs=1.0)
 
 
 @pytest.mark.parametrize("mass", [800.0, 1100.0])
