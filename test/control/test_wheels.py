@@ -613,3 +613,14 @@ def test_five_speeds_that_agree_are_right_at_once_where_each_axle_s_torque_is_sm
         state = with_torque(state, axle, part * rolling_torque_nm(axle))
         command, state = step(measured(0.0, rolling(speed), speed=speed), state, OFF)
     assert (command.doubted == 0) == right
+
+
+@WHEELS
+def test_a_brake_that_gives_less_counts_for_less_on_its_own_wheel(wheel):
+    before = remembered()
+    before = before._replace(motion=before.motion._replace(speed_mps=SPEED, brake_gain=one(wheel, 0.25, (1.0,) * 4)))
+    command, after = law.step(measured(-60e3), before, OFF, CAR, TABLE)
+    assert max(command.friction_torque_nm) < -10.0
+    gave = [state.total_nm - motor for state, motor in zip(after.wheels, command.motor_torque_nm, strict=True)]
+    part = [nm / told for nm, told in zip(gave, command.friction_torque_nm, strict=True)]
+    assert part == pytest.approx(one(wheel, 0.25, (1.0,) * 4))

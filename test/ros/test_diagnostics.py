@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from iwm_power_manager.control.actuators import ActuatorState, Evidence, MotorVerdict
 from iwm_power_manager.control.inputs import Violation, WheelVerdict
 from iwm_power_manager.control.monitor import Tally
+from iwm_power_manager.control.record import DECIDED_NAMES, command_of
 from iwm_power_manager.control.supervision import (
     MODE_DEGRADED,
     MODE_NORMAL,
@@ -17,7 +18,7 @@ from iwm_power_manager.control.supervision import (
     STALE_SPEED,
     Supervision,
 )
-from iwm_power_manager.nodes.power_manager_report import ChangeDetector
+from iwm_power_manager.nodes.power_manager_report import ChangeDetector, is_cut
 from iwm_power_manager.ros.diagnostics import (
     ERROR,
     OK,
@@ -211,3 +212,18 @@ def test_a_brake_that_gives_less_than_it_is_told_is_named():
     assert (status.level, status.message) == (ERROR, "brake fr is dead; brake rl is weak")
     assert status.values["brake rl: counted on (%)"] == "40"
     assert brakes_status((1.0,) * 4, ("fl", "fr", "rl", "rr")).level == OK
+
+
+@pytest.mark.parametrize(
+    ("given_w", "motor_factor", "asked_w", "cut"),
+    [
+        (100.0, 1.0, 9e3, True),
+        (9e3, 1.0, 9e3, False),
+        (0.0, 0.5, 9e3, False),  # an input is missing, and that is what is said
+        (0.0, 1.0, -9e3, False),  # braking is another matter
+        (0.0, 1.0, 300.0, False),  # creeping
+    ],
+)
+def test_only_driving_asked_for_in_earnest_and_with_all_inputs_there_counts_as_cut(given_w, motor_factor, asked_w, cut):
+    command = command_of((0.0,) * len(DECIDED_NAMES))._replace(front_power_w=0.5 * given_w, rear_power_w=0.5 * given_w)
+    assert is_cut(command, motor_factor, asked_w) is cut
