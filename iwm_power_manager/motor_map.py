@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iwm_power_manager import files
 from iwm_power_manager.errors import ConfigError
@@ -85,7 +86,7 @@ def read_map(path: Path | str) -> MotorMap:
     The CSV has the columns `speed_rad_s,torque_nm,efficiency`. Efficiency is mechanical over electrical power when
     driving and electrical over mechanical when regenerating (eq. 14, 15). At zero speed or zero torque it says nothing:
     whatever stands there is ignored. Points that are missing, empty, NaN or 0 are taken to lie outside the motor's
-    limits (`missing` checks that).
+    limits (`missing` checks that), but for a regeneration that brings nothing.
     """
     points: dict[tuple[float, float], float] = {}
     (first, header), *rows = read_table(path, "comma", "point").rows
@@ -136,22 +137,26 @@ def map_of(path: Path | str, efficiency: dict[tuple[float, float], float]) -> Mo
     if max(len(speeds), len(torques)) > MAX_AXIS_POINTS or len(speeds) * len(torques) > MAX_POINTS:
         problem = f"has {len(speeds)} speeds and {len(torques)} torques: its points lie on no grid"
         raise ConfigError(path, "", problem, f"{MAX_AXIS_POINTS} of each, {MAX_POINTS} in all")
-    loss = np.full((len(speeds), len(torques)), np.nan)
+    given = np.full((len(speeds), len(torques)), np.nan)
     row, column = ({value: i for i, value in enumerate(axis.tolist())} for axis in (speeds, torques))
     for (s, t), eta in efficiency.items():
-        power = s * t
-        if power > 0.0 and eta > 0.0:
-            loss[row[s], column[t]] = power / eta - power
-        elif power < 0.0 and (eta > 0.0 or _brakes_harder(efficiency, s, t, torques)):
-            loss[row[s], column[t]] = -power * (1.0 - eta)
+        given[row[s], column[t]] = eta
+    power = speeds[:, None] * torques
+    with np.errstate(divide="ignore", invalid="ignore"):
+        loss = np.where(power > 0.0, power / given - power, -power * (1.0 - given))
+    loss[~(given > 0.0) & ~((given == 0.0) & _brings_nothing(power, given)) | (power == 0.0)] = np.nan
     if np.all(np.isnan(loss)):
         raise ConfigError(path, "", "has no efficiency above 0 where speed and torque are not 0")
     return MotorMap(speeds, torques, loss)
 
 
-def _brakes_harder(efficiency: dict[tuple[float, float], float], s: float, t: float, torques: FloatArray) -> bool:
-    """Whether an efficiency of 0 is a regeneration that brings nothing: at a harder one it brings something."""
-    return efficiency[s, t] == 0.0 and any(efficiency.get((s, float(x)), 0.0) > 0.0 for x in torques[torques < t])
+def _brings_nothing(power_w: FloatArray, efficiency: FloatArray) -> NDArray[np.bool_]:
+    """Where an efficiency of 0 is a regeneration that brings nothing, as in slow driving, and no end of the map.
+
+    There the motor gets as much at the same speed, or at a higher one, from as hard a braking, or a harder one.
+    """
+    brings = ((power_w < 0.0) & (efficiency > 0.0))[::-1]
+    return (power_w < 0.0) & np.logical_or.accumulate(np.logical_or.accumulate(brings, axis=0)[::-1], axis=1)
 
 
 def mirrored(path: Path | str, given: MotorMap, mirror: bool | None) -> MotorMap:

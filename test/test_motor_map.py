@@ -173,6 +173,16 @@ def test_an_efficiency_of_zero_is_a_regeneration_that_brings_nothing_where_harde
     assert read_map(path).loss_w[0, 1] == 50.0
 
 
+def test_slow_braking_that_brings_nothing_at_any_torque_is_read_as_that_and_what_no_torque_reaches_is_not(tmp_path):
+    rows = {10: ("0", "0"), 20: ("0", "0.3"), 40: ("0.5", "0.6"), 80: ("0", "0.7")}  # at 80 rad/s -40 N m is too much
+    points = [
+        f"{w},{t},{e}" for w, pair in rows.items() for t, e in zip((-40, -5, 5, 40), (*pair, "0.8", "0.8"), strict=True)
+    ]
+    found = read_map(write(tmp_path, *points)).loss_w
+    assert found[:2, :2].tolist() == [[400.0, 50.0], [800.0, 0.7 * 100.0]]  # all that comes in, and no more is known
+    assert np.isnan(found[3, 0])
+
+
 BRAKING = ("10,-5,0.7", "10,-50,0.8", "20,-5,0.7", "20,-50,0.8")
 
 

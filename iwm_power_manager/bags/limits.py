@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from iwm_power_manager.errors import BagError
+from iwm_power_manager.share import did_you_mean
 
 _MEBIBYTE = 1024 * 1024
 
@@ -39,6 +40,16 @@ SQLITE_INSTRUCTIONS = 100_000_000
 SQLITE_INSTRUCTIONS_PER_BYTE = 100
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+
+def check_exists(path: Path) -> None:
+    """Refuse a path that is nowhere, or that nobody may look at, with the reason; `BagError`."""
+    try:
+        path.stat()
+    except FileNotFoundError:
+        raise BagError(f"{path}: does not exist{did_you_mean(path)}") from None
+    except (OSError, ValueError) as error:  # the latter for names no file can have
+        raise BagError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
 
 
 def regular_file(path: Path, folder: Path | None = None) -> int:

@@ -17,12 +17,11 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
-from iwm_power_manager.bags.limits import ZSTD_MAGIC, decompress, decompress_file, regular_file
+from iwm_power_manager.bags.limits import ZSTD_MAGIC, check_exists, decompress, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_source import MAGIC, McapSource
 from iwm_power_manager.bags.metadata import Topic, read_metadata, text_values
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError
-from iwm_power_manager.share import did_you_mean
 
 Source = McapSource | SqliteSource
 
@@ -72,8 +71,7 @@ class BagReader:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        if not os.path.exists(self.path):
-            raise BagError(f"{self.path}: does not exist{did_you_mean(self.path)}")
+        check_exists(self.path)
         self._stack = ExitStack()
         self._damage: list[str] = []
         self.sources: list[Source] = []

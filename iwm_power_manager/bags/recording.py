@@ -8,6 +8,7 @@ topic, start, stop, split, snapshot) goes through the same queue, in order with 
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from collections import deque
@@ -15,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 
@@ -100,9 +102,9 @@ class Recording:
         self._custom_data = dict(custom_data or {})
         self._topic_count = 0
         self._announced: list[Topic] = []  # by the writing thread, in the order of their numbers
-        self._wake = threading.Condition()
-        self._queue: deque[tuple[list[Sample], int] | Callable[[], object]] = deque()
-        self._queue_count = 0
+        self._lock = threading.Lock()
+        self._queue: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self._queue_count = 0  # messages in it
         self._status = RecordingStatus()  # of which `written` counts the bags before the current one
         self._writer: BagWriter | None = None
         self._last: BagWriter | None = None  # the bag being written, or the one before
@@ -110,10 +112,10 @@ class Recording:
         self._starts = self._snapshots = 0
         self._memory: deque[Sample] = deque()
         self._memory_bytes = 0
-        self._next_flush = time.monotonic()
+        self._next_flush = 0.0
         self._disk = ThreadPoolExecutor(1, "disk")
         self._on_disk_until: float | None = None  # what was given before is on the disk; None while nothing is written
-        self._closing = False
+        self._closing = self._closed = False
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
         self._thread.start()
 
@@ -123,32 +125,28 @@ class Recording:
         """Hand over messages in the order of their log times, and their list; never blocks."""
         size = _size(samples)
         status = self._status
-        with self._wake:
+        with self._lock:
             while samples and status.queue_bytes + size > self.options.queue_bytes:
                 size -= _size([samples.pop()])
                 status.dropped_queue += 1
-            if not samples:
-                return
-            self._queue.append((samples, size))
             status.queue_bytes += size
             self._queue_count += len(samples)
             status.queue_peak_bytes = max(status.queue_peak_bytes, status.queue_bytes)
-            self._wake.notify()
+        if samples:
+            self._queue.put(partial(self._take, samples, size))
 
     # --- called by anyone -------------------------------------------------------------------------------------------
 
     def add_topic(self, topic: Topic) -> int:
         """Announce a topic; returns the number its messages carry."""
-        with self._wake:
-            number = self._topic_count
+        with self._lock:
             self._topic_count += 1
-            self._enqueue(lambda: self._announce(topic))
-        return number
+            self._enqueue(partial(self._announce, topic))
+            return self._topic_count - 1
 
     def add_custom_data(self, values: Mapping[str, str]) -> None:
         """Add to the metadata of this bag and the following ones; does not wait."""
-        with self._wake:
-            self._enqueue(lambda: self._add_custom_data(values))
+        self._enqueue(partial(self._add_custom_data, values))
 
     def start(self) -> Path:
         """Begin a bag; returns its path. `BagError` if one is being recorded already, or it cannot be created."""
@@ -173,15 +171,14 @@ class Recording:
         try:
             self.call(lambda: self._stop() if self._writer is not None else self.path)
         finally:
-            with self._wake:
-                self._closing = True
-                self._wake.notify()
+            self._closing = True
+            self._queue.put(self._end)
             self._thread.join()
             self._disk.shutdown()
 
     def status(self) -> RecordingStatus:
         """Counts and state now."""
-        with self._wake:
+        with self._lock:
             writer, last, until = self._writer, self._last, self._on_disk_until
             written = writer.message_count if writer else 0
             return replace(
@@ -199,8 +196,7 @@ class Recording:
     def _enqueue(self, command: Callable[[], object]) -> None:
         if self._closing:
             raise BagError("the recorder is closing")
-        self._queue.append(command)
-        self._wake.notify()
+        self._queue.put(command)
 
     def call[T](self, command: Callable[[], T]) -> T:
         """Run something in the writing thread, behind all that was put; returns what it returns, or raises it."""
@@ -214,33 +210,27 @@ class Recording:
                     self._fail(error)
                 future.set_exception(error)
 
-        with self._wake:
-            self._enqueue(run)
+        self._enqueue(run)
         return future.result()
 
     def _run(self) -> None:
-        while True:
-            with self._wake:
-                if not self._queue and not self._closing:
-                    until_flush = max(0.0, self._next_flush - time.monotonic())
-                    self._wake.wait(until_flush if self._writer is not None else None)
-                item = self._queue.popleft() if self._queue else None
-                if item is None and self._closing:
-                    return
-                if isinstance(item, tuple):
-                    self._queue_count -= len(item[0])
-                    self._status.queue_bytes -= item[1]
+        while not self._closed:
+            wait_s = None if self._writer is None else max(0.0, self._next_flush - time.monotonic())
             try:
-                if isinstance(item, tuple):
-                    self._take(*item)
-                elif item is not None:
-                    item()
+                with suppress(queue.Empty):
+                    self._queue.get(timeout=wait_s)()
                 if self._writer is not None and time.monotonic() >= self._next_flush:
                     self._flush(self._writer)
             except Exception as error:  # noqa: BLE001 - a fault here must end as a failed recording, not in silence
                 self._fail(error)
 
+    def _end(self) -> None:
+        self._closed = True
+
     def _take(self, samples: list[Sample], size: int) -> None:
+        with self._lock:
+            self._queue_count -= len(samples)
+            self._status.queue_bytes -= size
         if self.options.snapshot_s > 0.0:
             self._remember(samples, size)
         if self._writer is None:
@@ -270,7 +260,7 @@ class Recording:
 
     def _reached(self, until: float) -> None:
         """What was in the file at `until` is on the disk (said by the disk's thread)."""
-        with self._wake:
+        with self._lock:
             if self._on_disk_until is not None:
                 self._on_disk_until = max(self._on_disk_until, until)
 
@@ -287,7 +277,7 @@ class Recording:
         self.failed.set()
 
     def _leave(self, writer: BagWriter) -> None:
-        with self._wake:
+        with self._lock:
             self._status.state = STOPPED
             self._on_disk_until = None
             self._status.written += writer.message_count
@@ -320,7 +310,7 @@ class Recording:
             raise BagError(str(error)) from None  # nothing has begun that could fail
         self._starts += 1
         self._next_flush = time.monotonic() + self.options.flush_period_s
-        with self._wake:
+        with self._lock:
             self._writer = self._last = writer
             self._status.state, self._status.error = RECORDING, ""
             self._on_disk_until = time.monotonic() if self.options.sync else None

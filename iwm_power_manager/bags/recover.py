@@ -23,7 +23,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
 
-from iwm_power_manager.bags.limits import ZSTD_MAGIC, regular_file
+from iwm_power_manager.bags.limits import ZSTD_MAGIC, check_exists, regular_file
 from iwm_power_manager.bags.mcap_file import McapFile
 from iwm_power_manager.bags.mcap_source import (
     FIRST_PRIVATE,
@@ -49,7 +49,6 @@ from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.files import sync_folder
-from iwm_power_manager.share import did_you_mean
 
 
 class FileRecovery(NamedTuple):
@@ -172,8 +171,7 @@ def recover(path: Path | str) -> Recovery:
 
 def _names(path: Path) -> list[Path]:
     """Data files; not those of which an earlier recovery has left its result beside them."""
-    if not os.path.exists(path):
-        raise BagError(f"{path}: does not exist{did_you_mean(path)}")
+    check_exists(path)
     if not os.path.isdir(path):
         if not path.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES):
             raise BagError(f"{path}: is no folder and no .mcap or .db3 file")

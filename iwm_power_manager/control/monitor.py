@@ -170,6 +170,7 @@ class InputMonitor:
     demand_speed_mps : speed of the car when the last demand was accepted
     direction : the driver asks for, 1 forwards, -1 reverse
     verdicts : what was wrong with each wheel in the last `wheel_states`
+    wheels_refused : how often a wheel was not believed, by its name and why
     motor_torque_nm : torques the motors reported since `collect_torques` was called last, NaN for each that did not
     tallies : counters by topic
     """
@@ -178,6 +179,7 @@ class InputMonitor:
         self._wheel_names = wheel_names
         self._limits = limits
         self.tallies = {topic: Tally() for topic in (SPEED, WHEELS, DEMAND, BATTERY, FRICTION)}
+        self.wheels_refused: Counter[tuple[str, WheelVerdict]] = Counter()
         self.forget()
 
     def forget(self) -> None:
@@ -265,6 +267,10 @@ class InputMonitor:
         )
         self._wheel_memory = judged.memory
         self.verdicts = judged.verdicts
+        if any(judged.verdicts):
+            self.wheels_refused.update(
+                found for found in zip(self._wheel_names, judged.verdicts, strict=True) if found[1]
+            )
         if any(math.isnan(speed) for speed in judged.speed_radps):
             return tally.note(Violation.AXLE_LOST, reading.stamp_ns)
         self.wheel_speed_radps = judged.speed_radps

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recomputed against recorded: how far apart, since when, by stamp."""
+"""What a replay finds; recomputed against recorded: how far apart, since when, by stamp."""
 
 from __future__ import annotations
 
 import math
 from collections import OrderedDict
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 #: Stamps one side may be ahead of the other before they count as having no counterpart.
@@ -61,6 +61,51 @@ class TopicComparison:
     def has_record(self) -> bool:
         """At least one message was recorded."""
         return self.compared + self.only_recorded > 0
+
+
+@dataclass
+class ReplayReport:
+    """What a replay did.
+
+    Attributes
+    ----------
+    notes : what was done other than asked, a line each
+    exact : steps were repeated from the recorded state; else made from the inputs
+    messages, steps : messages read, and control steps taken
+    first_stamp_ns, last_stamp_ns : of the steps
+    span_ns : driven: from each step to the next, jumps back left out
+    gaps : times at which steps are missing in the record, so that the law's memory is unknown
+    changed : steps whose torques are not the recorded ones, whatever the law remembers at a gap
+    restarts : pauses in the inputs after which the law started anew
+    bad_messages : messages that could not be decoded
+    dropped : inputs that were not believed, by topic, or wheel, and reason
+    faults : steps whose command no motor may be given, by reason
+    damage : what could not be read of the bag
+    comparison : recomputed against recorded, by topic
+    not_compared : commands that were not compared and why, a line each
+    """
+
+    notes: list[str]
+    exact: bool
+    messages: int = 0
+    steps: int = 0
+    first_stamp_ns: int = 0
+    last_stamp_ns: int = 0
+    span_ns: int = 0
+    gaps: int = 0
+    changed: int = 0
+    restarts: int = 0
+    bad_messages: int = 0
+    dropped: dict[str, dict[str, int]] = field(default_factory=dict)
+    faults: dict[str, int] = field(default_factory=dict)
+    damage: list[str] = field(default_factory=list)
+    comparison: list[TopicComparison] = field(default_factory=list)
+    not_compared: list[str] = field(default_factory=list)
+
+    def count_fault(self, reason: str) -> None:
+        """One more step without a command; "" is no reason."""
+        if reason:
+            self.faults[reason] = self.faults.get(reason, 0) + 1
 
 
 class TopicComparer:

@@ -10,7 +10,7 @@ import itertools
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -147,27 +147,23 @@ class SignalStream:
         """Bad messages of all topics."""
         return self.bad.total()
 
-    def use_log_times(self) -> str:
-        """Look at the bag's first messages: where header stamps do not advance, log times are used from here on.
-
-        Returns the line that says so; "" where stamps are used.
-        """
-        stamps: dict[str, list[tuple[int, int]]] = {}
-        for message in itertools.islice(self._bag.messages(), _PROBE_MESSAGES):
-            for value in self.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns):
-                if value.stamped:
-                    stamps.setdefault(message.topic, []).append((value.reading.stamp_ns, value.log_time_ns))
-        self.forget()
-        standing = sorted(topic for topic, found in stamps.items() if len(found) > 2 and not _advance(found))
-        if not standing:
-            return ""
-        self._by_stamp = False
-        return f"the header stamps of {', '.join(standing)} do not advance: log times are used"
-
-    def forget(self) -> None:
-        """Count from nought."""
+    def probe(self) -> list[tuple[str, Recorded]]:
+        """Topics and readings of the bag's first messages, which do not count."""
+        messages = itertools.islice(self._bag.messages(), _PROBE_MESSAGES)
+        found = [(message.topic, value) for message in messages for value in self.values(message)]
         for counts in (self.taken, self.bad, self.without):
             counts.clear()
+        return found
+
+    def use_log_times(self, probe: Iterable[tuple[str, Recorded]]) -> str:
+        """Use log times from here on, if the header stamps of a probe do not advance; the line that says so, or ""."""
+        stamps: dict[str, list[tuple[int, int]]] = {}
+        for topic, value in probe:
+            if value.stamped:
+                stamps.setdefault(topic, []).append((value.reading.stamp_ns, value.log_time_ns))
+        standing = sorted(topic for topic, found in stamps.items() if len(found) > 2 and not _advance(found))
+        self._by_stamp = not standing
+        return f"the header stamps of {', '.join(standing)} do not advance: log times are used" if standing else ""
 
     @property
     def topics(self) -> set[str]:
@@ -175,11 +171,12 @@ class SignalStream:
         return set(self._readers)
 
     def __iter__(self) -> Iterator[Recorded]:
-        for log_time, topic, data, publish_time, _ in self._bag.messages():
-            yield from self.values(topic, data, log_time, publish_time)
+        for message in self._bag.messages():
+            yield from self.values(message)
 
-    def values(self, topic: str, data: bytes, log_time_ns: int, publish_time_ns: int) -> list[Recorded]:
+    def values(self, message: Message) -> list[Recorded]:
         """Readings of one message; none if its topic carries no signal or the message is bad, which is counted."""
+        log_time_ns, topic, data, publish_time_ns, _ = message
         reader = self._readers.get(topic)
         if reader is None:
             return []

@@ -8,8 +8,9 @@ steps are made from the mapped input signals.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
 from iwm_power_manager.bags.reader import BagReader, Message
@@ -17,71 +18,41 @@ from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.control.record import DECIDED, DECIDED_NAMES, SIGNAL_NAMES, YOUNGER_SIGNALS
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.replay.commands import RecordedCommand, command_topics, commands_elsewhere, torques_nm
-from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
+from iwm_power_manager.replay.compare import ReplayReport, TopicComparer, TopicComparison
 from iwm_power_manager.replay.plan import Plan
-from iwm_power_manager.replay.recorded import SignalStream, check_signals, first_message
-from iwm_power_manager.replay.steps import ReconstructedSteps, RecordedSteps, ReplayedStep
+from iwm_power_manager.replay.recorded import first_message
+from iwm_power_manager.replay.steps import STATE_READER, ReconstructedSteps, RecordedSteps, ReplayedStep
 from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.commands import CommandWriter
 from iwm_power_manager.signals.contract import JOINT_STATE, NODE_FRICTION
 from iwm_power_manager.signals.contract import POWER_MANAGER_STATE as STATE
 from iwm_power_manager.signals.mapping import SignalMapping, topic_named
-from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
+from iwm_power_manager.signals.readings import joint_state_writer
 from iwm_power_manager.signals.types import definition_of
 
 #: How the state's topic ends, whatever its node is called.
 _STATE_OF_ANY = "/state"
-_STATE_READER = joint_state_reader("position")
 #: Messages between two calls of `progress`.
 PROGRESS_EVERY = 2000
-#: Below this share of the messages of the busiest topic, a replay says that it made few steps.
-_FEW_STEPS = 0.1
+#: Speed and wheels of a drive that are further apart on average are not in the units they were read in; below this sum
+#: of speeds, m/s, there is no drive.
+_APART = 1.25
+_MOVING_MPS = 10.0
+#: How many times too fast the speed seems, by what was read in a wrong unit, and how near to that counts.
+_LIKELY = {
+    3.6: "speed in km/h",
+    2.237: "speed in mph",
+    1.0 / 3.6: "speed in m/s, read as km/h",
+    math.pi / 30.0: "wheel_speed in rpm",
+    math.pi / 180.0: "wheel_speed in deg/s",
+}
+_NEAR = 0.05
 #: How many topics are named that may be a command under another name, and what to do with one.
 _CANDIDATES = 5
 _RENAME = "if it is one of them: --mapping with a copy of that file that has the recorded name"
 #: A replay takes so many messages, or bytes, at a time.
 _BATCH_MESSAGES = 2000
 _BATCH_BYTES = 16 * 1024 * 1024
-
-
-@dataclass
-class ReplayReport:
-    """What a replay did.
-
-    Attributes
-    ----------
-    notes : what was done other than asked, a line each
-    exact : steps were repeated from the recorded state; else made from the inputs
-    messages, steps : messages read, and control steps taken
-    first_stamp_ns, last_stamp_ns : of the steps
-    span_ns : driven: from each step to the next, jumps back left out
-    gaps : times at which steps are missing in the record, so that the law's memory is unknown
-    changed : steps whose torques are not the recorded ones, whatever the law remembers at a gap
-    restarts : pauses in the inputs after which the law started anew
-    bad_messages : messages that could not be decoded
-    dropped : inputs that were not believed, by topic and reason
-    faults : steps whose command no motor may be given, by reason
-    damage : what could not be read of the bag
-    comparison : recomputed against recorded, by topic
-    not_compared : commands that were not compared and why, a line each
-    """
-
-    notes: list[str]
-    exact: bool
-    messages: int = 0
-    steps: int = 0
-    first_stamp_ns: int = 0
-    last_stamp_ns: int = 0
-    span_ns: int = 0
-    gaps: int = 0
-    changed: int = 0
-    restarts: int = 0
-    bad_messages: int = 0
-    dropped: dict[str, dict[str, int]] = field(default_factory=dict)
-    faults: dict[str, int] = field(default_factory=dict)
-    damage: list[str] = field(default_factory=list)
-    comparison: list[TopicComparison] = field(default_factory=list)
-    not_compared: list[str] = field(default_factory=list)
 
 
 class Replay:
@@ -101,21 +72,19 @@ class Replay:
 
     def __init__(self, bag: BagReader, plan: Plan, tolerance: float = 0.0) -> None:
         self._bag = bag
+        self._radius_m = plan.vehicle.params.front.wheel.radius_m
+        self._shown_mps = self._rolled_mps = 0.0  # sums of the speed, and of the wheels' rims
         state = state_topic(bag)
-        self._state_topic = state if state and first_message(bag, state) else None
-        self._report = ReplayReport([*plan.notes], exact=self._state_topic is not None)
+        exact = state is not None and first_message(bag, state) is not None
+        report = self._report = ReplayReport([*plan.notes], exact)
         self._state_comparer = TopicComparer(state or STATE, tolerance, YOUNGER_SIGNALS)
         self._commands: dict[str, RecordedCommand] = {}
         self._find_commands(plan.mapping, tolerance)
-        self._recorded: RecordedSteps | None = None
-        if self.exact:
-            self._recorded = RecordedSteps(plan, tolerance)
-            return
-        self._stream = SignalStream(bag, plan.mapping, plan.vehicle.params)
-        check_signals(bag, plan.mapping, self._stream, wheels=True)
-        self._report.notes += [*self._stream.problems, *filter(None, [self._stream.use_log_times()])]
-        self._reconstructed = ReconstructedSteps(plan, self._stream)
-        self._stream.forget()
+        self._source: RecordedSteps | ReconstructedSteps
+        if state is not None and exact:
+            self._source = RecordedSteps(bag, plan, report, state, self._state_comparer, tolerance)
+        else:
+            self._source = ReconstructedSteps(bag, plan, report)
 
     @property
     def exact(self) -> bool:
@@ -129,8 +98,7 @@ class Replay:
         """
         report = self._report
         for batch in _batches(self._bag.messages()):
-            made = self._made(batch) if self._recorded is None else self._repeated(batch, self._recorded)
-            for message, steps in zip(batch, made, strict=True):
+            for message, steps in zip(batch, self._source.made(batch), strict=True):
                 report.messages += 1
                 if progress is not None and report.messages % PROGRESS_EVERY == 0:
                     progress(report.messages, message.log_time_ns)
@@ -151,47 +119,29 @@ class Replay:
     def report(self) -> ReplayReport:
         """What has been done so far."""
         compared = [*(command.result() for command in self._commands.values()), self._state_comparer.result()]
-        report = replace(
-            self._report, damage=self._bag.damage, comparison=[found for found in compared if found.has_record]
+        return replace(
+            self._report,
+            notes=[*self._report.notes, *self._source.notes(), *self._other_unit()],
+            dropped=self._source.not_believed(),
+            damage=self._bag.damage,
+            comparison=[found for found in compared if found.has_record],
         )
-        if self._recorded is not None:
-            report.gaps, report.changed = self._recorded.gaps, self._recorded.changed
-            report.faults = dict(self._recorded.faults)
-            return report
-        report.notes = [*report.notes, *self._lost_wheels(), *self._too_few_steps()]
-        report.bad_messages += self._stream.bad_messages
-        report.restarts, report.dropped = self._reconstructed.restarts, self._reconstructed.dropped
-        report.faults = dict(self._reconstructed.faults)
-        return report
 
     def why_no_step(self) -> str:
         """Why the bag gave no control step, topic by topic."""
-        if self.exact:
-            return f"{self._state_topic}: {self._report.bad_messages} messages that cannot be read"
-        parts = []
-        for topic in sorted(self._stream.topics):
-            part = f"{topic}: {self._stream.taken[topic]} messages"
-            if self._stream.bad[topic]:
-                part += f", {self._stream.bad[topic]} of them bad"
-            parts.append(part)
-        for name, reasons in self._reconstructed.dropped.items():
-            parts.append(f"{name} not believed: " + ", ".join(f"{count} {reason}" for reason, count in reasons.items()))
-        for reason, count in self._reconstructed.faults.items():
-            parts.append(f"{count} without a command: {reason}")
-        return "; ".join([*parts, *self._report.notes]) or "no message"
+        return self._source.why_none()
 
-    def _lost_wheels(self) -> list[str]:
-        """A line for each set of wheels that messages had no number for."""
-        without = self._stream.without.items()
-        return [f"{which} has no number in {count} messages: lost, as in the node" for which, count in without]
-
-    def _too_few_steps(self) -> list[str]:
-        """A line, if the bag gave far fewer steps than it holds wheel speeds."""
-        steps = self._report.steps
-        wheels = max(self._stream.taken[topic] for topic in self._stream.topics)
-        if not steps or steps > _FEW_STEPS * wheels:
+    def _other_unit(self) -> list[str]:
+        """A line, if speed and wheel speeds cannot both be in the unit they were read in."""
+        if min(self._shown_mps, self._rolled_mps) < _MOVING_MPS:
             return []
-        return [f"only {steps} steps of {wheels} messages: {self.why_no_step()}"]
+        ratio = self._shown_mps / self._rolled_mps
+        if 1.0 / _APART < ratio < _APART:
+            return []
+        likely = {**_LIKELY, 1.0 / self._radius_m: "wheel_speed in m/s"}
+        meant = [text for factor, text in likely.items() if math.isclose(ratio, factor, rel_tol=_NEAR)]
+        hint = " or ".join(meant) or "another unit, or another wheel radius"
+        return [f"speed is {ratio:.3g} times what wheel_speed and a radius of {self._radius_m:g} m give: {hint}?"]
 
     def _find_commands(self, mapping: SignalMapping, tolerance: float) -> None:
         for name, (kind, sink) in command_topics(self._bag, mapping).items():
@@ -215,43 +165,13 @@ class Replay:
             elif not sinks:
                 self._report.not_compared.append(f"{kind}: goes nowhere ({mapping.path})")
 
-    def _made(self, batch: Sequence[Message]) -> Iterator[list[ReplayedStep]]:
-        """The steps that each message of a batch causes as an input."""
-        for message in batch:
-            values = self._stream.values(message.topic, message.data, message.log_time_ns, message.publish_time_ns)
-            yield self._reconstructed.take(values) if values else []
-
-    def _repeated(self, batch: Sequence[Message], recorded: RecordedSteps) -> Iterator[list[ReplayedStep]]:
-        """The step of each message of a batch that is a recorded state."""
-        taken = [message.topic == self._state_topic and self._take_state(message, recorded) for message in batch]
-        steps = iter(recorded.repeated())
-        return ([step] if one and (step := next(steps)) is not None else [] for one in taken)
-
-    def _take_state(self, message: Message, steps: RecordedSteps) -> bool:
-        """Take a recorded state; False, and it counts as bad, if it is none."""
-        try:
-            stamp_ns, names, values = _STATE_READER(message.data)
-            steps.take(names, values, stamp_ns, message)
-        except KeyError as error:
-            raise BagError(
-                f"{self._bag.path}: {message.topic} lacks the signal {error}: recorded by another version"
-            ) from None
-        except (UnreadableError, ValueError):
-            self._report.bad_messages += 1
-            return False
-        if list(names) == SIGNAL_NAMES:
-            names, values = DECIDED_NAMES, values[DECIDED]
-        else:
-            found = dict(zip(names, values, strict=True))
-            names = tuple(name for name in DECIDED_NAMES if name in found)
-            values = tuple(found[name] for name in names)
-        self._state_comparer.recorded(stamp_ns, message.log_time_ns, names, values)
-        return True
-
     def _compare(self, step: ReplayedStep) -> None:
+        values = step.values
+        self._shown_mps += abs(values[0])
+        self._rolled_mps += abs(values[1] + values[2] + values[3] + values[4]) * 0.25 * self._radius_m
         for command in self._commands.values():
             command.recomputed(step)
-        self._state_comparer.recomputed(step.stamp_ns, step.log_time_ns, DECIDED_NAMES, tuple(step.values[DECIDED]))
+        self._state_comparer.recomputed(step.stamp_ns, step.log_time_ns, DECIDED_NAMES, tuple(values[DECIDED]))
 
 
 class ReplayOutput:
@@ -359,6 +279,6 @@ def _carries_steps(bag: BagReader, topic: str) -> bool:
     """Whether the first message of a topic names the signals of a control step."""
     first = first_message(bag, topic)
     try:
-        return first is not None and set(DECIDED_NAMES) - set(YOUNGER_SIGNALS) <= set(_STATE_READER(first.data).names)
+        return first is not None and set(DECIDED_NAMES) - set(YOUNGER_SIGNALS) <= set(STATE_READER(first.data).names)
     except UnreadableError:
         return False

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -11,11 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iwm_power_manager.bags.reader import Message
+from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.control import lockstep
 from iwm_power_manager.control.budget import BUCKET_MIN
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.guard import violated_bound
+from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import (
     BATTERY,
     DEMAND,
@@ -44,10 +44,13 @@ from iwm_power_manager.control.stepping import AsRecorded, Lockstep, Taken
 from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.thresholds import RECORDED, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.control.types import Command, ControllerState, SideGrip, WheelState, initial_state
+from iwm_power_manager.errors import BagError
+from iwm_power_manager.replay.compare import ReplayReport, TopicComparer
 from iwm_power_manager.replay.plan import Plan
-from iwm_power_manager.replay.recorded import Recorded
+from iwm_power_manager.replay.recorded import Recorded, SignalStream, check_signals
+from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.contract import WHEEL_NAMES
-from iwm_power_manager.signals.readings import DemandReading, FrictionReading
+from iwm_power_manager.signals.readings import DemandReading, FrictionReading, joint_state_reader
 
 #: What each kind of reading is to the controller.
 _TOPICS = {
@@ -58,7 +61,7 @@ _TOPICS = {
     FrictionReading: FRICTION,
 }
 #: Where these stand among a record's numbers, and torques and heat indices among those the law decides.
-_FRICTION, _DT = SIGNAL_NAMES.index("friction"), SIGNAL_NAMES.index("dt_s")
+_FRICTION, _DT, _LOST = map(SIGNAL_NAMES.index, ("friction", "dt_s", "wheels_lost"))
 _TORQUES, _HEAT = slice(0, 8), DECIDED_NAMES.index("front_heat")
 #: Memories that have given the same numbers, to within this, for so long, s, do not matter any more; a torque that is
 #: further from theirs, N m, has another reason.
@@ -77,6 +80,9 @@ FloatArray = NDArray[np.float64]
 _PAUSE_S = 1.0
 #: Values from the start of a bag that show whether its messages come in sets of one stamp.
 _PROBE_VALUES = 400
+#: Below this share of the messages of the busiest topic, a replay says that it made few steps.
+_FEW_STEPS = 0.1
+STATE_READER = joint_state_reader("position")
 
 
 class ReplayedStep(NamedTuple):
@@ -109,12 +115,7 @@ class _Due(NamedTuple):
 
 
 class _Block(NamedTuple):
-    """Recorded steps one after the other, with the same settings and policy.
-
-    Attributes
-    ----------
-    begins : number of its first step, where that is not the one after the step before
-    """
+    """Recorded steps with the same settings and policy; `begins`: number of the first, if that is not the next one."""
 
     settings: Settings
     table: PolicyTable
@@ -127,18 +128,24 @@ class RecordedSteps:
 
     They are taken many at a time: the law's memory takes longer on its way in and out of compiled code than a step.
 
-    Attributes
+    Parameters
     ----------
-    gaps : times at which the law's memory is unknown, because steps before are not in the bag
-    changed : steps whose torques are not the recorded ones, whatever the law remembers at a gap
-    faults : steps whose command no motor may be given; they come without a command
+    bag : open bag
+    plan : car, policies, settings
+    report : is told of gaps, changed steps and faults
+    topic : of the state
+    comparer : is given what was recorded
+    tolerance : largest difference that is none
     """
 
-    def __init__(self, plan: Plan, tolerance: float = 0.0) -> None:
-        self.gaps = 0
-        self.changed = 0
-        self.faults: Counter[str] = Counter()
+    def __init__(
+        self, bag: BagReader, plan: Plan, report: ReplayReport, topic: str, comparer: TopicComparer, tolerance: float
+    ) -> None:
+        self._path = bag.path
         self._plan = plan
+        self._report = report
+        self._topic = topic
+        self._comparer = comparer
         self._tolerance = tolerance
         self._memories = [initial_state()]  # of which the first counts
         self._recorded: Sequence[float] = ()  # settings
@@ -148,8 +155,53 @@ class RecordedSteps:
         self._stamp_ns = -1
         self._made: ReplayedStep | None = None
         self._alike_s = 0.0  # for how long all memories have given the same
+        self._lost: Counter[int] = Counter()  # steps by the wheels that were not believed
 
-    def take(self, names: Sequence[str], values: Sequence[float], stamp_ns: int, message: Message) -> None:
+    def made(self, batch: Sequence[Message]) -> Iterator[list[ReplayedStep]]:
+        """The step of each message of a batch that is a recorded state."""
+        taken = [message.topic == self._topic and self._take_message(message) for message in batch]
+        steps = iter([step for block in self._blocks for step in self._repeated(block)])
+        self._blocks = [block._replace(begins=None, due=[]) for block in self._blocks[-1:]]
+        return ([step] if one and (step := next(steps)) is not None else [] for one in taken)
+
+    def not_believed(self) -> dict[str, dict[str, int]]:
+        """Wheels that the node did not believe, by how many of the steps."""
+        steps = {
+            f"wheel {name}": sum(count for bits, count in self._lost.items() if bits >> i & 1)
+            for i, name in enumerate(WHEEL_NAMES)
+        }
+        return {wheel: {"steps": count} for wheel, count in steps.items() if count}
+
+    def why_none(self) -> str:
+        """Why there is no step."""
+        return f"{self._topic}: {self._report.bad_messages} messages that cannot be read"
+
+    def notes(self) -> list[str]:
+        """Nothing is done other than recorded."""
+        return []
+
+    def _take_message(self, message: Message) -> bool:
+        """Take a recorded state; False, and it counts as bad, if it is none."""
+        try:
+            stamp_ns, names, values = STATE_READER(message.data)
+            self._take(names, values, stamp_ns, message)
+        except KeyError as error:
+            raise BagError(
+                f"{self._path}: {message.topic} lacks the signal {error}: recorded by another version"
+            ) from None
+        except (UnreadableError, ValueError):
+            self._report.bad_messages += 1
+            return False
+        if list(names) == SIGNAL_NAMES:
+            names, values = DECIDED_NAMES, values[DECIDED]
+        else:
+            found = dict(zip(names, values, strict=True))
+            names = tuple(name for name in DECIDED_NAMES if name in found)
+            values = tuple(found[name] for name in names)
+        self._comparer.recorded(stamp_ns, message.log_time_ns, names, values)
+        return True
+
+    def _take(self, names: Sequence[str], values: Sequence[float], stamp_ns: int, message: Message) -> None:
         """Take one step's numbers; `KeyError` or `ValueError` if the message is of another kind or version."""
         plan = self._plan
         numbers = completed(names, values)
@@ -168,14 +220,10 @@ class RecordedSteps:
         if begins is not None or last is None or last.settings is not self._settings or last.table is not table:
             self._blocks.append(_Block(self._settings, table, begins, []))
         self._blocks[-1].due.append(_Due(*times, numbers))
-        self.gaps += bool(begins)
+        if 0.0 < numbers[_LOST] < 1 << len(WHEEL_NAMES):
+            self._lost[int(numbers[_LOST])] += 1
+        self._report.gaps += bool(begins)
         self._next, self._stamp_ns = number + 1, stamp_ns
-
-    def repeated(self) -> list[ReplayedStep | None]:
-        """One step for each that was taken since the last call; None for one without a command."""
-        made = [step for block in self._blocks for step in self._repeated(block)]
-        self._blocks = [block._replace(begins=None, due=[]) for block in self._blocks[-1:]]
-        return made
 
     def _repeated(self, block: _Block) -> Iterator[ReplayedStep | None]:
         rows = iter(self._computed(block, [due.numbers for due in block.due if due.numbers]))
@@ -184,7 +232,7 @@ class RecordedSteps:
                 row = next(rows)
                 command = command_of(row[DECIDED])
                 problem = violated_bound(command, self._plan.vehicle.params)
-                self.faults.update([problem] if problem else [])
+                self._report.count_fault(problem)
                 self._made = None if problem else ReplayedStep(*due[:3], command, row, due.numbers)
             yield self._made and self._made._replace(log_time_ns=due.log_time_ns, publish_time_ns=due.publish_time_ns)
 
@@ -204,7 +252,7 @@ class RecordedSteps:
             repeat(numbers, memory, block.settings, self._plan.vehicle.params, block.table, result)
             for memory, result in zip(self._memories, results, strict=True)
         ]
-        self.changed += self._changed(numbers, results)
+        self._report.changed += self._changed(numbers, results)
         if all(memory == self._memories[0] for memory in self._memories):
             del self._memories[1:]
         numbers[:, DECIDED] = results[0]
@@ -284,19 +332,25 @@ class ReconstructedSteps:
 
     Parameters
     ----------
+    bag : open bag
     plan : car, policies, settings
-    probe : readings from its start
+    report : is told of what was done other than expected, restarts and faults
 
-    Attributes
-    ----------
-    in_sets : the inputs come in sets of one stamp
-    faults : steps whose command no motor may be given
+    Raises
+    ------
+    BagError
+        The bag lacks a signal that is needed.
     """
 
-    def __init__(self, plan: Plan, probe: Iterable[Recorded]) -> None:
-        self.faults: Counter[str] = Counter()
+    def __init__(self, bag: BagReader, plan: Plan, report: ReplayReport) -> None:
         self._plan = plan
-        self.in_sets = _in_sets(probe)
+        self._report = report
+        self._stream = stream = SignalStream(bag, plan.mapping, plan.vehicle.params)
+        check_signals(bag, plan.mapping, stream, wheels=True)
+        probe = stream.probe()
+        standing = stream.use_log_times(probe)
+        report.notes += [*stream.problems, *filter(None, [standing])]
+        self._in_sets = not standing and _in_sets([value for _, value in probe[:_PROBE_VALUES]])
         vehicle = plan.vehicle.params
         limits = ControllerLimits(
             input_limits(RECORDED, vehicle.front.wheel.radius_m, by_clock=False),
@@ -309,22 +363,52 @@ class ReconstructedSteps:
         self._lockstep = Lockstep(self._controller, plan.period_s)
         self._recorded = AsRecorded(self._controller, plan.period_s, _PAUSE_S)
 
-    @property
-    def restarts(self) -> int:
-        """Pauses in the recording, or jumps back, after which the law started anew."""
-        return self._lockstep.restarts + self._recorded.restarts
+    def made(self, batch: Sequence[Message]) -> Iterator[list[ReplayedStep]]:
+        """The steps that each message of a batch causes as an input."""
+        for message in batch:
+            bad = self._stream.bad_messages
+            yield self._of(self._stream.values(message))
+            self._report.bad_messages += self._stream.bad_messages - bad
+            self._report.restarts = self._lockstep.restarts + self._recorded.restarts
 
-    @property
-    def dropped(self) -> dict[str, dict[str, int]]:
-        """Inputs that were not believed: counts by reason, by topic."""
-        return {
+    def not_believed(self) -> dict[str, dict[str, int]]:
+        """Inputs that were not believed: counts by reason, by topic and wheel."""
+        monitor = self._controller.monitor
+        found = {
             topic: {reason.name.lower(): count for reason, count in tally.dropped.items()}
-            for topic, tally in self._controller.monitor.tallies.items()
+            for topic, tally in monitor.tallies.items()
             if tally.dropped
         }
+        for (wheel, verdict), count in monitor.wheels_refused.items():
+            if verdict is not WheelVerdict.ABSENT:  # that is said of the messages
+                found.setdefault(f"wheel {wheel}", {})[verdict.name.lower()] = count
+        return found
 
-    def take(self, values: Sequence[Recorded]) -> list[ReplayedStep]:
-        """The readings of one message; returns the steps they cause."""
+    def why_none(self) -> str:
+        """Why there is no step, topic by topic."""
+        taken, bad = self._stream.taken, self._stream.bad
+        parts = [
+            f"{topic}: {taken[topic]} messages" + (f", {bad[topic]} of them bad" if bad[topic] else "")
+            for topic in sorted(self._stream.topics)
+        ]
+        for name, reasons in self.not_believed().items():
+            parts.append(f"{name} not believed: " + ", ".join(f"{count} {reason}" for reason, count in reasons.items()))
+        parts += [f"{count} without a command: {reason}" for reason, count in self._report.faults.items()]
+        return "; ".join([*parts, *self._report.notes]) or "no message"
+
+    def notes(self) -> list[str]:
+        """A line for each set of wheels that messages had no number for, and one if there were few steps."""
+        stream, steps = self._stream, self._report.steps
+        found = [
+            f"{which} has no number in {count} messages: lost, as in the node"
+            for which, count in stream.without.items()
+        ]
+        most = max(stream.taken[topic] for topic in stream.topics)
+        if 0 < steps <= _FEW_STEPS * most:
+            found.append(f"only {steps} steps of {most} messages: {self.why_none()}")
+        return found
+
+    def _of(self, values: Sequence[Recorded]) -> list[ReplayedStep]:
         steps: list[ReplayedStep] = []
         for value in values:
             reading: Any = value.reading
@@ -333,8 +417,11 @@ class ReconstructedSteps:
                 self._friction(reading.friction, reading.stamp_ns)
             elif topic is not None:
                 content = reading.power_w if topic == DEMAND else reading
-                taken = (self._push if self.in_sets else self._use)(topic, content, reading.stamp_ns, value)
-                steps += [step for one in taken for step in self._replayed(one, value)]
+                for taken in (self._push if self._in_sets else self._use)(topic, content, reading.stamp_ns, value):
+                    self._report.count_fault(taken.fault)
+                    if taken.step is not None:  # else a fault, or the same set once more
+                        times = taken.stamp_ns, value.log_time_ns, value.publish_time_ns
+                        steps.append(ReplayedStep(*times, *taken.step))
         return steps
 
     def _push(self, topic: str, content: Any, now_ns: int, value: Recorded) -> Iterable[Taken]:
@@ -366,18 +453,11 @@ class ReconstructedSteps:
             controller.friction = controller.monitor.friction
             controller.policy = self._plan.policies.table(self._plan.settings.strategy, controller.friction)
 
-    def _replayed(self, taken: Taken, value: Recorded) -> list[ReplayedStep]:
-        if taken.fault:
-            self.faults[taken.fault] += 1
-        if taken.step is None:
-            return []  # a fault, or the same set once more
-        return [ReplayedStep(taken.stamp_ns, value.log_time_ns, value.publish_time_ns, *taken.step)]
 
-
-def _in_sets(probe: Iterable[Recorded]) -> bool:
+def _in_sets(probe: Sequence[Recorded]) -> bool:
     """Whether speed, wheel speeds and battery come with the same stamps, as in lock-step."""
     stamps: dict[type, set[int]] = {SpeedReading: set(), JointReading: set(), BatteryReading: set()}
-    for value in itertools.islice(probe, _PROBE_VALUES):
+    for value in probe:
         if type(value.reading) in stamps:
             if not value.stamped:
                 return False

@@ -28,8 +28,9 @@ from iwm_power_manager.errors import BagError, ConfigError, IwmError, one_line
 from iwm_power_manager.exit_codes import CANNOT_TELL, DONE, FAILED
 from iwm_power_manager.files import atomic_write, check_number
 from iwm_power_manager.replay.commands import command_topics, commands_elsewhere
+from iwm_power_manager.replay.compare import ReplayReport
 from iwm_power_manager.replay.plan import Choice, Plan, make_plan, recorded_mapping, unknown_mapping
-from iwm_power_manager.replay.run import Replay, ReplayOutput, ReplayReport, exceeds, report_topics
+from iwm_power_manager.replay.run import Replay, ReplayOutput, exceeds, report_topics
 from iwm_power_manager.replay.what_if import Consumption, what_if
 from iwm_power_manager.signals.mapping import SignalMapping
 from iwm_power_manager.tools.command import described, ended, made_with

@@ -14,8 +14,10 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from bags_helpers import FLOAT64, float64, topic
+from disk_helpers import private_folder
 from iwm_power_manager.bags.metadata import parse_qos
 from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.signals.types import standard_types
@@ -232,3 +234,25 @@ def test_qos_of_every_rosbag2_version_is_understood() -> None:
     assert profile.durability.name == "TRANSIENT_LOCAL"
     assert (profile.depth, profile.deadline, profile.lifespan) == (5, (0, 7), (1, 0))
     assert parse_qos("") == parse_qos("nonsense") == parse_qos("[1, 2]") == parse_qos("{") == ()
+
+
+@pytest.mark.parametrize("opened", [BagReader, recover], ids=["read", "recovered"])
+@pytest.mark.parametrize(
+    ("name", "problem"),
+    [
+        ("locked/bag", "Permission denied"),
+        ("n" * 300, "File name too long"),
+        ("a\0b", "embedded null"),
+        ("file/bag", "Not a directory"),
+        ("nothing", "does not exist"),
+    ],
+)
+def test_a_bag_that_nobody_may_look_at_is_refused_with_the_reason(
+    opened: Callable[[Path], object], name: str, problem: str
+) -> None:
+    with private_folder() as folder:
+        (folder / "locked").mkdir()
+        (folder / "locked").chmod(0o000)
+        (folder / "file").write_text("")
+        with pytest.raises(BagError, match=problem):
+            opened(folder / name)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -123,6 +124,54 @@ def test_a_wheel_without_a_number_is_lost_as_in_the_node_and_the_replay_drives_o
     report, _ = replayed(bag, mapping)
     assert (report.steps, report.bad_messages) == (COUNT, 0)
     assert report.notes == [f"/joint_states: front_right has no number in {COUNT} messages: lost, as in the node"]
+
+
+@pytest.mark.parametrize(
+    ("value", "why"), [(1e300, "out_of_range"), (-90.0, "opposite")], ids=["beyond any wheel", "backwards"]
+)
+def test_a_wheel_that_is_not_believed_is_said_with_how_often(
+    tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str], value: float, why: str
+) -> None:
+    bag = write_bag(tmp_path / "bag", drive(velocity=lambda _, w: (w, w, value, w)))
+    assert main([str(bag), "--mapping", str(mapping), "--strategy", "equal"]) == DONE
+    out = capsys.readouterr().out
+    assert f"  wheel rear_left: not believed: {COUNT} {why}\n" in out
+    assert "Wh" not in out
+    report, _ = replayed(bag, mapping)
+    assert report.dropped == {"wheel rear_left": {why: COUNT}}
+    out_path = tmp_path / "out"
+    assert main([str(bag), "--mapping", str(mapping), "--strategy", "equal", "--output", str(out_path)]) == DONE
+    report, _ = replayed(out_path, mapping)  # repeated from the state it wrote
+    assert (report.exact, report.dropped) == (True, {"wheel rear_left": {"steps": COUNT}})
+
+
+@pytest.mark.parametrize(
+    ("speed", "wheels", "hint"),
+    [
+        (3.6, 1.0, "speed is 3.6 times what wheel_speed and a radius of 0.33 m give: speed in km/h?"),
+        (2.237, 1.0, "speed is 2.24 times what wheel_speed and a radius of 0.33 m give: speed in mph?"),
+        (
+            1.0 / 3.6,
+            1.0,
+            "speed is 0.278 times what wheel_speed and a radius of 0.33 m give: speed in m/s, read as km/h?",
+        ),
+        (1.0, 0.33, "speed is 3.03 times what wheel_speed and a radius of 0.33 m give: wheel_speed in m/s?"),
+        (1.0, 0.6, "another unit, or another wheel radius?"),
+        (1.0, 1.1, ""),
+    ],
+)
+def test_speed_and_wheels_that_are_not_in_the_units_they_are_read_in_are_said(
+    tmp_path: Path, mapping: Path, speed: float, wheels: float, hint: str
+) -> None:
+    entries = drive(velocity=lambda _, w: (w * wheels,) * 4)
+    found = [
+        (t, n, data[:-8] + struct.pack("<d", speed * struct.unpack("<d", data[-8:])[0]))
+        for t, n, data in entries
+        if n == 0
+    ]
+    report, _ = replayed(write_bag(tmp_path / "bag", sorted([*found, *(e for e in entries if e[1])])), mapping)
+    assert len(report.notes) == bool(hint)
+    assert all(hint in note for note in report.notes)
 
 
 def test_compressed_messages_are_read_without_any_metadata(tmp_path: Path, mapping: Path) -> None:
