@@ -40,9 +40,10 @@ from numpy.typing import NDArray
 from iwm_power_manager import __version__
 from iwm_power_manager.archive import read_npz
 from iwm_power_manager.control.budget import DEARER
-from iwm_power_manager.control.table import PolicyTable, as_vector
+from iwm_power_manager.control.strategies import STRATEGIES, name_of
+from iwm_power_manager.control.table import PolicyTable, as_vector, empty_table
 from iwm_power_manager.errors import ConfigError, PolicyError
-from iwm_power_manager.files import atomic_write, check_name, check_number
+from iwm_power_manager.files import atomic_write, check_name, check_number, content_sha256
 from iwm_power_manager.mdp.budget import Trial
 from iwm_power_manager.mdp.demand import DemandChain, Source
 from iwm_power_manager.mdp.policy_iteration import GATED, Iteration, Solution, expect_over_demand
@@ -51,6 +52,7 @@ from iwm_power_manager.mdp.problem import Problem, problem_from
 from iwm_power_manager.model.decision import (
     axles_gated,
 )
+from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle
 
 FORMAT_NAME = "iwm_power_manager policy"
@@ -471,3 +473,57 @@ def choose(bank: Sequence[Policy], friction: float) -> Policy:
     if not (math.isfinite(friction) and friction > 0.0):
         raise PolicyError(f"friction {friction} is out of range; allowed: > 0")
     return min(bank, key=lambda policy: (abs(math.log(friction / policy.friction)), policy.friction))
+
+
+class PolicyBank:
+    """Policies by friction, loaded when a strategy first needs one.
+
+    Parameters
+    ----------
+    path : file or folder; "" for none
+    rule : coefficients of the strategy `rule`
+    vehicle : the car they have to be solved for
+    why_none : what to say where a policy is needed and there is none
+    """
+
+    def __init__(self, path: str, rule: Sequence[float], vehicle: Vehicle, why_none: str = "") -> None:
+        self._path = path
+        self._why_none = why_none or "the strategy needs a policy; name one with --policy"
+        self._rule = tuple(rule)
+        self._vehicle = vehicle
+        self._bank: list[Policy] = []
+        self._tables: dict[str, PolicyTable] = {}
+        self._empty = empty_table(rule=self._rule)
+
+    def table(self, strategy: int, friction: float) -> PolicyTable:
+        """Numbers for the law, of the policy whose friction is nearest.
+
+        Raises
+        ------
+        PolicyError
+            The strategy needs a policy, and there is none that is whole and for this car.
+        """
+        if not STRATEGIES[name_of(strategy)].needs_policy:
+            return self._empty
+        if not self._path:
+            raise PolicyError(self._why_none)
+        self._bank = self._bank or load_policy_bank(resolve(self._path), self._vehicle)
+        policy = choose(self._bank, friction)
+        if policy.checksum not in self._tables:
+            self._tables[policy.checksum] = policy.table(self._rule)
+        return self._tables[policy.checksum]
+
+    @property
+    def checksums(self) -> list[str]:
+        """Identities of the policies loaded so far."""
+        return [policy.checksum for policy in self._bank]
+
+    @property
+    def used(self) -> list[str]:
+        """Grid and checksum of the policies that steps were decided with so far."""
+        return [policy.identity for policy in self._bank or [] if policy.checksum in self._tables]
+
+    @property
+    def content_sha256(self) -> str:
+        """Hash of the file or folder, as a recorder takes it; "" if no step needed a policy."""
+        return content_sha256(resolve(self._path)) if self._bank else ""

@@ -19,7 +19,7 @@ from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.settings import Settings, default_settings
 from iwm_power_manager.control.thresholds import Thresholds, actuator_limits, for_car, input_limits, supervision_limits
-from iwm_power_manager.replay.plan import PolicyBank
+from iwm_power_manager.policy import PolicyBank
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.closed_loop import BATTERY_TEMPERATURE_DEGC, Run, decision_of
 from iwm_sim.drive import Drive, Sensors

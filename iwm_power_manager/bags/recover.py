@@ -31,7 +31,6 @@ from iwm_power_manager.bags.mcap_source import (
     ChannelMessage,
     Definitions,
     McapSource,
-    Record,
     split,
     walk,
 )
@@ -138,11 +137,11 @@ def recover(path: Path | str) -> Recovery:
     with ExitStack() as stack:
         files: list[_File] = []
         left_out: list[FileRecovery] = []
-        names = _names(path)
+        names, gaps = _names(path), _Gaps()
         for name in names:
             try:
                 regular_file(name, folder)
-                files.append(_File(name, stack))
+                files.append(_File(name, stack, gaps))
             except BagError as error:
                 left_out.append(FileRecovery(name.name, False, 0, str(error)))
         if not files:
@@ -158,13 +157,12 @@ def recover(path: Path | str) -> Recovery:
         stale = folder is not None and not (fits and not any(file.report.rebuilt for file in files))
         if stale:
             _write_metadata(path, files, "sqlite3" if sqlite else "mcap", information)
-        spans = [file.seen.span for file in files if file.seen.count]
         return Recovery(
             path,
             [file.report for file in files] + left_out,
-            _missing(files),
-            min((start_ns for start_ns, _ in spans), default=0),
-            max((end_ns for _, end_ns in spans), default=0),
+            dict(+gaps.missing),
+            min((file.seen.start_ns for file in files if file.seen.count), default=0),
+            max(file.seen.end_ns for file in files),
             stale,
         )
 
@@ -188,54 +186,47 @@ def _target(path: Path) -> Path:
     return path.with_name(path.name.removesuffix(COMPRESSED_SUFFIX)).with_suffix(".mcap")
 
 
+class _Gaps:
+    """By topic, the publisher's numbers left out in files and between them, as the messages are taken."""
+
+    def __init__(self) -> None:
+        self.missing: Counter[str] = Counter()
+        self._last: dict[str, int] = {}
+
+    def take(self, topic: str, sequence: int) -> None:
+        self.missing[topic] += max(sequence - self._last.get(topic, sequence) - 1, 0)
+        self._last[topic] = sequence
+
+
 class _Seen:
-    """All messages of an MCAP or sqlite3 file, read and counted.
+    """All messages of a file, read and counted: by channel, in all, the first and the last, compressed one by one."""
 
-    Attributes
-    ----------
-    source : the file
-    counts, count, span : messages by channel and in all, and the log times of the first and the last
-    numbers : by topic the publisher's first and last number, and how many are left out in between
-    compressed : the messages are compressed one by one
-    """
-
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, gaps: _Gaps) -> None:
         self.source = source
+        self.topics = source.topics()
         self.counts: Counter[int] = Counter()
         self.compressed = False
-        start_ns, end_ns = 2**64, 0
-        numbers: dict[int, list[int]] = {}
-        own = is_own(source)  # other recorders count something else
+        self.start_ns, self.end_ns = 2**64, 0
+        own = _is_own(source)  # other recorders count something else
         for log_time, channel, data, _, sequence in source.messages():
             self.counts[channel] += 1
-            start_ns, end_ns = min(start_ns, log_time), max(end_ns, log_time)
+            self.start_ns, self.end_ns = min(self.start_ns, log_time), max(self.end_ns, log_time)
             self.compressed = self.compressed or data[:4] == ZSTD_MAGIC
-            if sequence and own:
-                known = numbers.setdefault(channel, [sequence, sequence, 0])
-                known[2] += max(sequence - known[1] - 1, 0)
-                known[1] = sequence
+            if sequence and own and channel in self.topics:
+                gaps.take(self.topics[channel].name, sequence)
         self.count = self.counts.total()
-        self.span = (start_ns, end_ns) if self.count else (0, 0)
-        self.topics = source.topics()
-        self.numbers = {self.topics[number].name: known for number, known in numbers.items() if number in self.topics}
 
 
 class _File:
-    """A data file and what becomes of it.
+    """A data file and what becomes of it: what is wrong with it, and what was found, at last in the rebuilt one."""
 
-    Attributes
-    ----------
-    problem : what is wrong with it; "" for a whole one
-    report, seen : of the original, and once it is rebuilt of the result
-    """
-
-    def __init__(self, path: Path, stack: ExitStack) -> None:
+    def __init__(self, path: Path, stack: ExitStack, gaps: _Gaps) -> None:
         self._stack = stack
         self.path = path
         self.is_compressed = path.suffix == COMPRESSED_SUFFIX
         self._temporary: Path | None = None
         opened, problem = _opened(path, stack)
-        self.seen = _Seen(open_source(opened, path, stack))
+        self.seen = _Seen(open_source(opened, path, stack), gaps)
         self.is_sqlite = isinstance(self.seen.source, SqliteSource)
         self.problem = problem or "; ".join(self.seen.source.damage[:3])
         self.report = FileRecovery(path.name, False, self.seen.count, "")
@@ -247,19 +238,17 @@ class _File:
         try:
             temporary.unlink(missing_ok=True)
             self._stack.callback(temporary.unlink, missing_ok=True)
-            copy = _Copy(self.seen.source, temporary)
-            made = _Seen(open_source(temporary, target, self._stack))
+            lost, torn = _copy(self.seen.source, temporary)
+            made = _Seen(open_source(temporary, target, self._stack), _Gaps())
         except OSError as error:
             raise BagError(f"{temporary}: cannot be written: {error.strerror or error}") from None
         if made.source.damage or made.count < self.seen.count:
             raise BagError(
                 f"{temporary}: holds {made.count} of {self.seen.count} messages; the original is left as it is"
             )
-        kept = self.path.name if target != self.path else ""
-        if target == self.path and (copy.lost or copy.torn):
-            kept = f"{target.name}.damaged"
+        kept = self.path.name if target != self.path else f"{target.name}.damaged" if lost or torn else ""
         what = self.problem or ("is compressed" if self.is_compressed else "is sqlite3 beside MCAP")
-        self.report = FileRecovery(target.name, True, made.count, what, copy.torn, copy.lost, kept)
+        self.report = FileRecovery(target.name, True, made.count, what, torn, lost, kept)
         self.seen, self.path, self._temporary = made, target, temporary
 
     def put_in_place(self) -> None:
@@ -280,8 +269,7 @@ class _File:
             raise BagError(f"{self._temporary}: cannot be written: {error.strerror or error}") from None
 
 
-def is_own(source: Source) -> bool:
-    """Whether this project's recorder has written a file."""
+def _is_own(source: Source) -> bool:
     return source.header.library.startswith(LIBRARY.partition(" ")[0])
 
 
@@ -299,79 +287,56 @@ def _opened(path: Path, stack: ExitStack) -> tuple[Path, str]:
     return folder / path.name, "has a journal: the recorder did not finish"
 
 
-class _Copy:
-    """Writes what can be read of a file to a new MCAP file.
+def _copy(source: Source, target: Path) -> tuple[int, int]:
+    """Write what can be read of a file to a new MCAP file.
 
-    Attributes
-    ----------
-    lost : chunks, or stretches without a record, that could not be read
-    torn : bytes at the end that hold no whole record
+    Returns the number of chunks, or stretches, that could not be read, and of torn bytes at its end.
     """
+    lost = torn = 0
+    file = McapFile(target, library=source.header.library or LIBRARY, profile=source.header.profile)
+    writer = file.writer
+    numbers: dict[int, int] = {}  # by the channels of the old file those of the new one
 
-    def __init__(self, source: Source, target: Path) -> None:
-        self.lost = 0
-        self.torn = 0
-        self._channels: dict[int, int] = {}  # by the numbers of the old file those of the new one
-        self._file = McapFile(target, library=source.header.library or LIBRARY, profile=source.header.profile)
-        try:
-            if isinstance(source, McapSource):
-                self._announce(source.definitions)
-                for record in walk(source.data):
-                    self._take(source, record)
-            else:
-                self._channels = {number: announce(self._file, topic) for number, topic in source.topics().items()}
-                self._write(source.messages())
-            self._file.finish()
-        except BaseException:
-            self._file.abandon()
-            raise
-
-    def _announce(self, definitions: Definitions) -> None:
-        """All channels with their schemas, as they were."""
-        for number, channel in definitions.channels.items():
-            schema = definitions.schema_of(channel)
-            schema_id = self._file.schema_id(schema.name, schema.encoding, schema.data) if schema.id else 0
-            self._channels[number] = self._file.writer.register_channel(
-                channel.topic, channel.message_encoding, schema_id, channel.metadata
-            )
-
-    def _take(self, source: McapSource, record: Record) -> None:
-        data, found, writer = source.data, record.content, self._file.writer
-        if record.opcode == Opcode.CHUNK:
-            try:
-                self._write(split(source.raw(record), Definitions()))
-            except BagError:
-                self.lost += 1
-        elif record.opcode == Opcode.MESSAGE:
-            self._write(split(data[record.start : record.end], Definitions()))
-        elif isinstance(found, Attachment):
-            writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
-        elif isinstance(found, Metadata):
-            writer.add_metadata(found.name, found.metadata)
-        elif record.opcode >= FIRST_PRIVATE:
-            self._file.write(data[record.start : record.end])
-        elif record.opcode == UNREADABLE and record.end < len(data):
-            self.lost += 1
-        elif record.opcode == UNREADABLE:
-            self.torn = record.end - record.start
-
-    def _write(self, messages: Iterable[ChannelMessage]) -> None:
-        writer = self._file.writer
+    def write(messages: Iterable[ChannelMessage]) -> None:
         for log_time, channel, data, publish_time, sequence in messages:
-            if channel not in self._channels:  # its announcement is lost; what was sent on it is not
-                self._channels[channel] = writer.register_channel(f"/recovered/channel_{channel}", "cdr", 0, {})
-            writer.add_message(self._channels[channel], log_time, data, publish_time, sequence)
+            if channel not in numbers:  # its announcement is lost; what was sent on it is not
+                numbers[channel] = writer.register_channel(f"/recovered/channel_{channel}", "cdr", 0, {})
+            writer.add_message(numbers[channel], log_time, data, publish_time, sequence)
 
-
-def _missing(files: Iterable[_File]) -> dict[str, int]:
-    """By topic, the publisher's numbers left out in files and between them."""
-    found: Counter[str] = Counter()
-    last: dict[str, int] = {}
-    for file in files:
-        for topic, (first, end, left_out) in file.seen.numbers.items():
-            found[topic] += left_out + max(first - last.get(topic, first) - 1, 0)
-            last[topic] = end
-    return dict(+found)
+    try:
+        if isinstance(source, SqliteSource):
+            numbers |= {number: announce(file, topic) for number, topic in source.topics().items()}
+            write(source.messages())
+        else:
+            for number, channel in source.definitions.channels.items():
+                schema = source.definitions.schema_of(channel)
+                key = file.schema_id(schema.name, schema.encoding, schema.data) if schema.id else 0
+                numbers[number] = writer.register_channel(
+                    channel.topic, channel.message_encoding, key, channel.metadata
+                )
+            for record in walk(source.data):
+                found, raw = record.content, source.data[record.start : record.end]
+                if record.opcode == Opcode.CHUNK:
+                    try:
+                        write(split(source.raw(record), Definitions()))
+                    except BagError:
+                        lost += 1
+                elif record.opcode == Opcode.MESSAGE:
+                    write(split(raw, Definitions()))
+                elif isinstance(found, Attachment):
+                    writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
+                elif isinstance(found, Metadata):
+                    writer.add_metadata(found.name, found.metadata)
+                elif record.opcode >= FIRST_PRIVATE:
+                    file.write(raw)
+                elif record.opcode == UNREADABLE and record.end < len(source.data):
+                    lost += 1
+                elif record.opcode == UNREADABLE:
+                    torn = len(raw)
+        file.finish()
+    finally:
+        file.abandon()
+    return lost, torn
 
 
 def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Mapping[str, object]) -> None:
@@ -385,13 +350,17 @@ def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Ma
         custom_data.update(source.custom_data)
         if isinstance(source, McapSource):  # "" is this one
             known = source.information.get("ros_distro") or source.metadata.get("rosbag2", {}).get("ROS_DISTRO")
-            distro = distro or str(known or ("" if is_own(source) else "unknown"))
+            distro = distro or str(known or ("" if _is_own(source) else "unknown"))
         for number, topic in file.seen.topics.items():
             topics.setdefault(topic.name, topic)
             counts[topic.name] += file.seen.counts[number]
     information = bag_information(
         storage,
-        [FileSpan(file.path.name, *file.seen.span, file.seen.count) for file in files],
+        [
+            FileSpan(file.path.name, seen.start_ns if seen.count else 0, seen.end_ns, seen.count)
+            for file in files
+            for seen in [file.seen]
+        ],
         [(topic, counts[name]) for name, topic in topics.items()],
         custom_data | text_values(recorded.get("custom_data")),
         distro=distro,

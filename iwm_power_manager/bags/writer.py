@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -289,10 +289,15 @@ class BagWriter:
     def _finish_file(self, file: McapFile) -> None:
         try:
             with self._failing():
-                if file.broken:
-                    file.abandon()
-                else:
-                    finish(file, list(zip(self._topics, self._channels, strict=True)), self.custom_data)
+                if not file.broken:
+                    file.writer.flush()
+                    counts = [
+                        (topic, file.counts[channel])
+                        for topic, channel in zip(self._topics, self._channels, strict=True)
+                    ]
+                    information = bag_information("mcap", [file.span], counts, self.custom_data)
+                    file.writer.add_metadata("rosbag2", {"serialized_metadata": yaml_text(information)})
+                    file.finish(sync=False)
                     self._on_disk(partial(_sync_file, file.path))
         finally:
             file.abandon()
@@ -325,15 +330,6 @@ def announce(file: McapFile, topic: Topic) -> int:
     qos = yaml_text(qos_entries(topic.qos)) if topic.qos else ""
     metadata = {"offered_qos_profiles": qos, "topic_type_hash": topic.type_hash}
     return file.writer.register_channel(topic.name, topic.serialization, schema, metadata)
-
-
-def finish(file: McapFile, channels: Sequence[tuple[Topic, int]], custom_data: Mapping[str, str]) -> None:
-    """Complete a file with the metadata rosbag2 keeps inside, and close it; the disk may still have to take it."""
-    file.writer.flush()
-    counts = [(topic, file.counts[channel]) for topic, channel in channels]
-    information = bag_information("mcap", [file.span], counts, custom_data)
-    file.writer.add_metadata("rosbag2", {"serialized_metadata": yaml_text(information)})
-    file.finish(sync=False)
 
 
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:

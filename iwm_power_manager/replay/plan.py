@@ -10,12 +10,9 @@ from typing import Any, NamedTuple
 
 from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.settings import DEFAULTS, Settings
-from iwm_power_manager.control.strategies import STRATEGIES, name_of
-from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.control.types import WHEEL_NAMES
-from iwm_power_manager.errors import ConfigError, PolicyError
-from iwm_power_manager.files import content_sha256
-from iwm_power_manager.policy import Policy, choose, load_policy_bank
+from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.policy import PolicyBank
 from iwm_power_manager.share import resolve, roots, share_path
 from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, SignalMapping, load_mapping
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
@@ -54,60 +51,6 @@ class Choice(NamedTuple):
     friction: float | None = None
     settings: Sequence[str] = ()
     mapping: str | None = None
-
-
-class PolicyBank:
-    """Policies by friction, loaded when a strategy first needs one.
-
-    Parameters
-    ----------
-    path : file or folder; "" for none
-    rule : coefficients of the strategy `rule`
-    vehicle : the car they have to be solved for
-    why_none : what to say where a policy is needed and there is none
-    """
-
-    def __init__(self, path: str, rule: Sequence[float], vehicle: Vehicle, why_none: str = "") -> None:
-        self._path = path
-        self._why_none = why_none or "the strategy needs a policy; name one with --policy"
-        self._rule = tuple(rule)
-        self._vehicle = vehicle
-        self._bank: list[Policy] = []
-        self._tables: dict[str, PolicyTable] = {}
-        self._empty = empty_table(rule=self._rule)
-
-    def table(self, strategy: int, friction: float) -> PolicyTable:
-        """Numbers for the law, of the policy whose friction is nearest.
-
-        Raises
-        ------
-        PolicyError
-            The strategy needs a policy, and there is none that is whole and for this car.
-        """
-        if not STRATEGIES[name_of(strategy)].needs_policy:
-            return self._empty
-        if not self._path:
-            raise PolicyError(self._why_none)
-        self._bank = self._bank or load_policy_bank(resolve(self._path), self._vehicle)
-        policy = choose(self._bank, friction)
-        if policy.checksum not in self._tables:
-            self._tables[policy.checksum] = policy.table(self._rule)
-        return self._tables[policy.checksum]
-
-    @property
-    def checksums(self) -> list[str]:
-        """Identities of the policies loaded so far."""
-        return [policy.checksum for policy in self._bank]
-
-    @property
-    def used(self) -> list[str]:
-        """Grid and checksum of the policies that steps were decided with so far."""
-        return [policy.identity for policy in self._bank or [] if policy.checksum in self._tables]
-
-    @property
-    def content_sha256(self) -> str:
-        """Hash of the file or folder, as a recorder takes it; "" if no step needed a policy."""
-        return content_sha256(resolve(self._path)) if self._bank else ""
 
 
 class Plan(NamedTuple):

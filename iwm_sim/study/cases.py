@@ -25,8 +25,7 @@ from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write
 from iwm_power_manager.model.parameters import VehicleParams
-from iwm_power_manager.policy import Policy, load_policy
-from iwm_power_manager.replay.plan import PolicyBank
+from iwm_power_manager.policy import Policy, PolicyBank, load_policy
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import Vehicle, load_vehicle, with_params
 from iwm_sim import closed_loop, preview
