@@ -35,15 +35,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema, Statistics
 
-from iwm_power_manager.bags.limits import (
-    MAX_CHANNELS,
-    MAX_CHUNK_MESSAGES,
-    MAX_OVERLAP_BYTES,
-    MAX_RECORDS,
-    MESSAGE_OVERHEAD_BYTES,
-    decompress,
-    regular_file,
-)
+from iwm_power_manager.bags import limits
 from iwm_power_manager.bags.metadata import CUSTOM_METADATA, Topic, information_of, parse_qos, text_values
 from iwm_power_manager.errors import BagError
 
@@ -103,7 +95,7 @@ def walk(data: Bytes, offset: int = len(MAGIC)) -> Iterator[Record]:
     `BagError`: there are more than any honest file has.
     """
     size = len(data)
-    for _ in range(MAX_RECORDS):
+    for _ in range(limits.MAX_RECORDS):
         if offset >= size:
             return
         record = _record_at(data, offset) or Record(UNREADABLE, offset, offset, _next_chunk(data, offset + 1))
@@ -111,7 +103,7 @@ def walk(data: Bytes, offset: int = len(MAGIC)) -> Iterator[Record]:
         if record.opcode == Opcode.FOOTER:
             return
         offset = record.end
-    raise BagError(f"holds more than {MAX_RECORDS} records")
+    raise BagError(f"holds more than {limits.MAX_RECORDS} records")
 
 
 def _record_at(data: Bytes, offset: int) -> Record | None:
@@ -160,8 +152,8 @@ class Definitions:
         """Add one; the first of a number counts. `BagError` if there are too many."""
         known: dict[int, Any] = self.schemas if isinstance(found, Schema) else self.channels
         known.setdefault(found.id, found)
-        if len(known) > MAX_CHANNELS:
-            raise BagError(f"holds more than {MAX_CHANNELS} channels")
+        if len(known) > limits.MAX_CHANNELS:
+            raise BagError(f"holds more than {limits.MAX_CHANNELS} channels")
 
     def schema_of(self, channel: Channel) -> Schema:
         """A channel's schema; an empty one where there is none."""
@@ -186,7 +178,7 @@ def split(raw: bytes, definitions: Definitions) -> list[ChannelMessage]:
     append, unpack = messages.append, _MESSAGE.unpack_from
     offset, size = 0, len(raw)
     message = int(Opcode.MESSAGE)
-    while offset + HEAD_BYTES <= size and len(messages) <= MAX_CHUNK_MESSAGES:
+    while offset + HEAD_BYTES <= size and len(messages) <= limits.MAX_CHUNK_MESSAGES:
         if raw[offset] == message and offset + RECORD_OVERHEAD_BYTES <= size:
             _, length, channel, sequence, log_time, publish_time = unpack(raw, offset)
             end = offset + HEAD_BYTES + length
@@ -201,8 +193,8 @@ def split(raw: bytes, definitions: Definitions) -> list[ChannelMessage]:
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 definitions.take(_read(_KINDS[opcode], raw, Record(opcode, offset, offset + HEAD_BYTES, end)))
         offset = end
-    if len(messages) > MAX_CHUNK_MESSAGES:
-        raise BagError(f"holds more than {MAX_CHUNK_MESSAGES} messages")
+    if len(messages) > limits.MAX_CHUNK_MESSAGES:
+        raise BagError(f"holds more than {limits.MAX_CHUNK_MESSAGES} messages")
     return messages
 
 
@@ -247,7 +239,7 @@ class McapSource:
         self.header = Header(profile="ros2", library="")
         self.start_ns = self.end_ns = 0
         self._pieces: list[Piece] = []
-        if regular_file(path) == 0:
+        if limits.regular_file(path) == 0:
             raise BagError(f"{path}: is empty")
         try:
             with path.open("rb") as stream:
@@ -361,14 +353,14 @@ class McapSource:
             ready = 0 if waiting else bisect_right(messages, next_ns, key=itemgetter(0))
             yield from messages[:ready]
             for message in messages[ready:]:
-                size += len(message[2]) + MESSAGE_OVERHEAD_BYTES
+                size += len(message[2]) + limits.MESSAGE_OVERHEAD_BYTES
                 heapq.heappush(waiting, (message[0], next(order), message))
-            if size > MAX_OVERLAP_BYTES:
+            if size > limits.MAX_OVERLAP_BYTES:
                 self.note("its chunks overlap in time by more than fits into memory: not all is in order")
                 next_ns = _NEVER
             while waiting and waiting[0][0] <= next_ns:
                 message = heapq.heappop(waiting)[2]
-                size -= len(message[2]) + MESSAGE_OVERHEAD_BYTES
+                size -= len(message[2]) + limits.MESSAGE_OVERHEAD_BYTES
                 yield message
 
     def unpack(self, piece: Piece) -> list[ChannelMessage]:
@@ -386,7 +378,7 @@ class McapSource:
     def raw(self, record: Record) -> bytes:
         """Content of a chunk; `BagError` if it is damaged or too large."""
         chunk: Chunk = _read(Chunk, self.data, record)
-        raw = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
+        raw = limits.decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
         if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:
             raise BagError("is damaged: its checksum is wrong")
         return raw

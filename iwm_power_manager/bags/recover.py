@@ -23,27 +23,10 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Metadata
 
+from iwm_power_manager.bags import mcap_source, reader
 from iwm_power_manager.bags.limits import ZSTD_MAGIC, check_exists, regular_file
 from iwm_power_manager.bags.mcap_file import McapFile
-from iwm_power_manager.bags.mcap_source import (
-    FIRST_PRIVATE,
-    UNREADABLE,
-    ChannelMessage,
-    Definitions,
-    McapSource,
-    split,
-    walk,
-)
 from iwm_power_manager.bags.metadata import FileSpan, Topic, bag_information, read_metadata, text_values
-from iwm_power_manager.bags.reader import (
-    COMPRESSED_SUFFIX,
-    SUFFIXES,
-    Source,
-    data_files,
-    listed_files,
-    open_source,
-    opened_file,
-)
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
 from iwm_power_manager.errors import BagError
@@ -147,7 +130,7 @@ def recover(path: Path | str) -> Recovery:
         if not files:
             raise BagError(f"{left_out[0].damage}; nothing to recover")
         information, problem = read_metadata(path) if folder else ({}, "none")
-        fits = not (problem or left_out) and listed_files(information).keys() == {name.name for name in names}
+        fits = not (problem or left_out) and reader.listed_files(information).keys() == {name.name for name in names}
         sqlite = all(file.is_sqlite and not file.problem for file in files)
         for file in files:
             if file.problem or (file.is_sqlite and not sqlite) or (file.is_compressed and not fits):
@@ -171,10 +154,10 @@ def _names(path: Path) -> list[Path]:
     """Data files; not those of which an earlier recovery has left its result beside them."""
     check_exists(path)
     if not os.path.isdir(path):
-        if not path.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES):
+        if not path.name.removesuffix(reader.COMPRESSED_SUFFIX).endswith(reader.SUFFIXES):
             raise BagError(f"{path}: is no folder and no .mcap or .db3 file")
         return [path]
-    names = data_files(path)
+    names = reader.data_files(path)
     names = [name for name in names if _target(name) == name or _target(name) not in names]
     if not names:
         raise BagError(f"{path}: holds no .mcap or .db3 file")
@@ -183,7 +166,7 @@ def _names(path: Path) -> list[Path]:
 
 def _target(path: Path) -> Path:
     """Where the recovered file goes."""
-    return path.with_name(path.name.removesuffix(COMPRESSED_SUFFIX)).with_suffix(".mcap")
+    return path.with_name(path.name.removesuffix(reader.COMPRESSED_SUFFIX)).with_suffix(".mcap")
 
 
 class _Gaps:
@@ -201,7 +184,7 @@ class _Gaps:
 class _Seen:
     """All messages of a file, read and counted: by channel, in all, the first and the last, compressed one by one."""
 
-    def __init__(self, source: Source, gaps: _Gaps) -> None:
+    def __init__(self, source: reader.Source, gaps: _Gaps) -> None:
         self.source = source
         self.topics = source.topics()
         self.counts: Counter[int] = Counter()
@@ -223,10 +206,10 @@ class _File:
     def __init__(self, path: Path, stack: ExitStack, gaps: _Gaps) -> None:
         self._stack = stack
         self.path = path
-        self.is_compressed = path.suffix == COMPRESSED_SUFFIX
+        self.is_compressed = path.suffix == reader.COMPRESSED_SUFFIX
         self._temporary: Path | None = None
         opened, problem = _opened(path, stack)
-        self.seen = _Seen(open_source(opened, path, stack), gaps)
+        self.seen = _Seen(reader.open_source(opened, path, stack), gaps)
         self.is_sqlite = isinstance(self.seen.source, SqliteSource)
         self.problem = problem or "; ".join(self.seen.source.damage[:3])
         self.report = FileRecovery(path.name, False, self.seen.count, "")
@@ -239,7 +222,7 @@ class _File:
             temporary.unlink(missing_ok=True)
             self._stack.callback(temporary.unlink, missing_ok=True)
             lost, torn = _copy(self.seen.source, temporary)
-            made = _Seen(open_source(temporary, target, self._stack), _Gaps())
+            made = _Seen(reader.open_source(temporary, target, self._stack), _Gaps())
         except OSError as error:
             raise BagError(f"{temporary}: cannot be written: {error.strerror or error}") from None
         if made.source.damage or made.count < self.seen.count:
@@ -269,7 +252,7 @@ class _File:
             raise BagError(f"{self._temporary}: cannot be written: {error.strerror or error}") from None
 
 
-def _is_own(source: Source) -> bool:
+def _is_own(source: reader.Source) -> bool:
     return source.header.library.startswith(LIBRARY.partition(" ")[0])
 
 
@@ -277,7 +260,7 @@ def _opened(path: Path, stack: ExitStack) -> tuple[Path, str]:
     """The file itself, or a copy that can be read, and what is wrong with it."""
     journals = [journal for end in ("-wal", "-journal") if (journal := path.with_name(path.name + end)).is_file()]
     if not journals:
-        return opened_file(path, stack, beside=True)
+        return reader.opened_file(path, stack, beside=True)
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_recover_", dir=path.parent)))
     for file in (path, *journals):
         regular_file(file)
@@ -287,7 +270,7 @@ def _opened(path: Path, stack: ExitStack) -> tuple[Path, str]:
     return folder / path.name, "has a journal: the recorder did not finish"
 
 
-def _copy(source: Source, target: Path) -> tuple[int, int]:
+def _copy(source: reader.Source, target: Path) -> tuple[int, int]:
     """Write what can be read of a file to a new MCAP file.
 
     Returns the number of chunks, or stretches, that could not be read, and of torn bytes at its end.
@@ -297,7 +280,7 @@ def _copy(source: Source, target: Path) -> tuple[int, int]:
     writer = file.writer
     numbers: dict[int, int] = {}  # by the channels of the old file those of the new one
 
-    def write(messages: Iterable[ChannelMessage]) -> None:
+    def write(messages: Iterable[mcap_source.ChannelMessage]) -> None:
         for log_time, channel, data, publish_time, sequence in messages:
             if channel not in numbers:  # its announcement is lost; what was sent on it is not
                 numbers[channel] = writer.register_channel(f"/recovered/channel_{channel}", "cdr", 0, {})
@@ -314,24 +297,24 @@ def _copy(source: Source, target: Path) -> tuple[int, int]:
                 numbers[number] = writer.register_channel(
                     channel.topic, channel.message_encoding, key, channel.metadata
                 )
-            for record in walk(source.data):
+            for record in mcap_source.walk(source.data):
                 found, raw = record.content, source.data[record.start : record.end]
                 if record.opcode == Opcode.CHUNK:
                     try:
-                        write(split(source.raw(record), Definitions()))
+                        write(mcap_source.split(source.raw(record), mcap_source.Definitions()))
                     except BagError:
                         lost += 1
                 elif record.opcode == Opcode.MESSAGE:
-                    write(split(raw, Definitions()))
+                    write(mcap_source.split(raw, mcap_source.Definitions()))
                 elif isinstance(found, Attachment):
                     writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
                 elif isinstance(found, Metadata):
                     writer.add_metadata(found.name, found.metadata)
-                elif record.opcode >= FIRST_PRIVATE:
+                elif record.opcode >= mcap_source.FIRST_PRIVATE:
                     file.write(raw)
-                elif record.opcode == UNREADABLE and record.end < len(source.data):
+                elif record.opcode == mcap_source.UNREADABLE and record.end < len(source.data):
                     lost += 1
-                elif record.opcode == UNREADABLE:
+                elif record.opcode == mcap_source.UNREADABLE:
                     torn = len(raw)
         file.finish()
     finally:
@@ -348,7 +331,7 @@ def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Ma
     for file in files:
         source = file.seen.source
         custom_data.update(source.custom_data)
-        if isinstance(source, McapSource):  # "" is this one
+        if isinstance(source, mcap_source.McapSource):  # "" is this one
             known = source.information.get("ros_distro") or source.metadata.get("rosbag2", {}).get("ROS_DISTRO")
             distro = distro or str(known or ("" if _is_own(source) else "unknown"))
         for number, topic in file.seen.topics.items():

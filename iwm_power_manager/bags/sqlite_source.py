@@ -23,12 +23,7 @@ import apsw
 from mcap.records import Header
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-from iwm_power_manager.bags.limits import (
-    MAX_CHUNK_BYTES,
-    SQLITE_INSTRUCTIONS,
-    SQLITE_INSTRUCTIONS_PER_BYTE,
-    regular_file,
-)
+from iwm_power_manager.bags import limits
 from iwm_power_manager.bags.mcap_source import ChannelMessage
 from iwm_power_manager.bags.metadata import Topic, parse_qos
 from iwm_power_manager.errors import BagError
@@ -54,13 +49,15 @@ class SqliteSource:
         self.header = Header(profile="ros2", library="")
         self.custom_data: dict[str, str] = {}  # there is none in these files
         self._topics: dict[int, Topic] = {}
-        self._steps = (SQLITE_INSTRUCTIONS + SQLITE_INSTRUCTIONS_PER_BYTE * regular_file(path)) // _STEP
+        self._steps = (
+            limits.SQLITE_INSTRUCTIONS + limits.SQLITE_INSTRUCTIONS_PER_BYTE * limits.regular_file(path)
+        ) // _STEP
         try:
             address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
             self._database = stack.enter_context(closing(sqlite3.connect(address, uri=True)))
             self._database.row_factory = sqlite3.Row
             self._database.text_factory = lambda text: text.decode("utf-8", "replace")
-            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.MAX_CHUNK_BYTES)
             self._database.set_progress_handler(self._out_of_steps, _STEP)
             self._database.execute("PRAGMA trusted_schema = OFF")
             # A truncated file is refused as a whole, unless one says that one knows.

@@ -18,17 +18,9 @@ from pathlib import Path
 from typing import Any, Self
 
 from iwm_power_manager import __version__
+from iwm_power_manager.bags import metadata
 from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
 from iwm_power_manager.bags.mcap_source import RECORD_OVERHEAD_BYTES
-from iwm_power_manager.bags.metadata import (
-    CUSTOM_METADATA,
-    METADATA_FILE,
-    FileSpan,
-    Topic,
-    bag_information,
-    qos_entries,
-    yaml_text,
-)
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.files import atomic_write, sync_folder
 
@@ -105,10 +97,10 @@ class BagWriter:
         self.custom_data = dict(custom_data or {})
         self._disk = disk
         self._disk_work: deque[Future[None]] = deque()
-        self._topics: list[Topic] = []
+        self._topics: list[metadata.Topic] = []
         self._counts: list[int] = []
         self._channels: list[int] = []
-        self._spans: list[FileSpan] = []
+        self._spans: list[metadata.FileSpan] = []
         self._closed = False
         self._closed_bytes = 0
         self._splits = self.options.max_bytes > 0 or self.options.max_duration_ns > 0
@@ -149,7 +141,7 @@ class BagWriter:
         """Files of the bag so far."""
         return len(self._spans) + (1 if self._file else 0)
 
-    def add_topic(self, topic: Topic) -> int:
+    def add_topic(self, topic: metadata.Topic) -> int:
         """Announce a topic; returns the number that `write` takes."""
         self._topics.append(topic)
         self._counts.append(0)
@@ -161,7 +153,7 @@ class BagWriter:
         """Add to the custom metadata, in the file at once."""
         self.custom_data.update(values)
         with self._failing():
-            self._open.writer.add_metadata(CUSTOM_METADATA, dict(values))
+            self._open.writer.add_metadata(metadata.CUSTOM_METADATA, dict(values))
 
     def write(
         self, topic: int, log_time_ns: int, data: bytes, publish_time_ns: int | None = None, sequence: int = 0
@@ -243,7 +235,7 @@ class BagWriter:
                 self._check_disk(wait=True)
         finally:
             topics = list(zip(self._topics, self._counts, strict=True))
-            write_metadata(self.path, bag_information("mcap", self._spans, topics, self.custom_data))
+            write_metadata(self.path, metadata.bag_information("mcap", self._spans, topics, self.custom_data))
 
     def abandon(self) -> None:
         """Close without index and metadata, as a crash would leave the bag (see `recover`)."""
@@ -278,7 +270,7 @@ class BagWriter:
             try:
                 self._on_disk(partial(sync_folder, self.path))
                 if self.custom_data:
-                    file.writer.add_metadata(CUSTOM_METADATA, self.custom_data)
+                    file.writer.add_metadata(metadata.CUSTOM_METADATA, self.custom_data)
                 self._channels = [announce(file, topic) for topic in self._topics]
             except OSError:
                 file.remove()
@@ -295,8 +287,8 @@ class BagWriter:
                         (topic, file.counts[channel])
                         for topic, channel in zip(self._topics, self._channels, strict=True)
                     ]
-                    information = bag_information("mcap", [file.span], counts, self.custom_data)
-                    file.writer.add_metadata("rosbag2", {"serialized_metadata": yaml_text(information)})
+                    information = metadata.bag_information("mcap", [file.span], counts, self.custom_data)
+                    file.writer.add_metadata("rosbag2", {"serialized_metadata": metadata.yaml_text(information)})
                     file.finish(sync=False)
                     self._on_disk(partial(_sync_file, file.path))
         finally:
@@ -323,18 +315,20 @@ def _make_folder(path: Path) -> None:
         sync_folder(folder.parent)
 
 
-def announce(file: McapFile, topic: Topic) -> int:
+def announce(file: McapFile, topic: metadata.Topic) -> int:
     """Write a topic's schema and channel into a file; returns the channel's id."""
     definition = topic.definition.encode("utf-8", "surrogateescape")
     schema = file.schema_id(topic.type, topic.encoding, definition) if definition else 0
-    qos = yaml_text(qos_entries(topic.qos)) if topic.qos else ""
-    metadata = {"offered_qos_profiles": qos, "topic_type_hash": topic.type_hash}
-    return file.writer.register_channel(topic.name, topic.serialization, schema, metadata)
+    qos = metadata.yaml_text(metadata.qos_entries(topic.qos)) if topic.qos else ""
+    more = {"offered_qos_profiles": qos, "topic_type_hash": topic.type_hash}
+    return file.writer.register_channel(topic.name, topic.serialization, schema, more)
 
 
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
     """Write a bag's `metadata.yaml`; `WriteFailed` if it cannot be. What it says is of `metadata.bag_information`."""
     try:
-        atomic_write(folder / METADATA_FILE, yaml_text({"rosbag2_bagfile_information": information}).encode())
+        atomic_write(
+            folder / metadata.METADATA_FILE, metadata.yaml_text({"rosbag2_bagfile_information": information}).encode()
+        )
     except ConfigError as error:
         raise WriteFailed(str(error)) from None

@@ -24,18 +24,10 @@ from iwm_power_manager.mdp.demand import Source, signal_source
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.share import resolve
+from iwm_power_manager.signals import readings
 from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.signals.mapping import DEMANDS, PEDALS, SignalMapping, load_mapping, topic_named
-from iwm_power_manager.signals.readings import (
-    Assembly,
-    DemandReading,
-    MotionReading,
-    Reading,
-    TopicReader,
-    TorqueReading,
-    topic_readers,
-)
 from iwm_power_manager.signals.types import Types, types_of
 from iwm_power_manager.vehicle import Vehicle
 
@@ -63,7 +55,7 @@ class Recorded(NamedTuple):
     log_time_ns: int
     publish_time_ns: int
     stamped: bool
-    reading: Reading
+    reading: readings.Reading
 
 
 class RecordedDrive(NamedTuple):
@@ -139,8 +131,10 @@ class SignalStream:
         if any(demand in wanted for demand in DEMANDS):
             wanted = [signal for signal in wanted if signal not in PEDALS]
         self.signals = set(wanted)
-        readers = topic_readers(mapping, types, Assembly(WHEEL_NAMES, vehicle), wanted) if wanted else {}
-        self._readers: dict[str, TopicReader] = {held[topic]: reader for topic, reader in readers.items()}
+        readers = (
+            readings.topic_readers(mapping, types, readings.Assembly(WHEEL_NAMES, vehicle), wanted) if wanted else {}
+        )
+        self._readers: dict[str, readings.TopicReader] = {held[topic]: reader for topic, reader in readers.items()}
 
     @property
     def bad_messages(self) -> int:
@@ -182,23 +176,23 @@ class SignalStream:
             return []
         self.taken[topic] += 1
         try:
-            readings = reader.read(data, log_time_ns)
+            found = reader.read(data, log_time_ns)
         except UnreadableError:
             self.bad[topic] += 1
             return []
-        for reading in readings:
+        for reading in found:
             if not _usable(reading):
                 self.bad[topic] += 1
                 return []
             if isinstance(reading, JointReading) and not all(map(math.isfinite, reading.values)):
-                found = zip(reading.names, reading.values, strict=False)  # in the order of the message
-                missing = [name for name, value in found if not math.isfinite(value)]
+                pairs = zip(reading.names, reading.values, strict=False)  # in the order of the message
+                missing = [name for name, value in pairs if not math.isfinite(value)]
                 self.without[f"{topic}: {', '.join(missing)}"] += 1
         stamped = reader.stamped
         if stamped and not self._by_stamp:
             stamped = False
-            readings = tuple(reading._replace(stamp_ns=log_time_ns) for reading in readings)
-        return [Recorded(log_time_ns, publish_time_ns, stamped, reading) for reading in readings]
+            found = tuple(reading._replace(stamp_ns=log_time_ns) for reading in found)
+        return [Recorded(log_time_ns, publish_time_ns, stamped, reading) for reading in found]
 
 
 def _advance(times: Sequence[tuple[int, int]]) -> bool:
@@ -230,11 +224,11 @@ def first_message(bag: BagReader, topic: str) -> Message | None:
     return next((message for message in bag.messages() if message.topic == topic), None)
 
 
-def _usable(reading: Reading) -> bool:
+def _usable(reading: readings.Reading) -> bool:
     """Whether what has to be a number is one: of four wheels one, of a battery its state of charge."""
     if isinstance(reading, JointReading):
         return any(map(math.isfinite, reading.values))
-    if isinstance(reading, TorqueReading | MotionReading):
+    if isinstance(reading, readings.TorqueReading | readings.MotionReading):
         return True  # nobody needs them
     return math.isfinite(reading.soc if isinstance(reading, BatteryReading) else reading[1])
 
@@ -268,7 +262,7 @@ def read_signal(
             if isinstance(reading, SpeedReading):
                 speed = reading.speed_mps
                 stamp = reading.stamp_ns if stamped else -1
-            elif isinstance(reading, DemandReading) and not math.isnan(speed):
+            elif isinstance(reading, readings.DemandReading) and not math.isnan(speed):
                 rows.append((log_time_ns, stamp, reading.power_w, speed))
         damage = [*reader.damage, *stream.problems]
     if not rows:

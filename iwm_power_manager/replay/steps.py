@@ -11,33 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iwm_power_manager.bags.reader import BagReader, Message
-from iwm_power_manager.control import lockstep
+from iwm_power_manager.control import lockstep, monitor, record
 from iwm_power_manager.control.budget import BUCKET_MIN
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
-from iwm_power_manager.control.monitor import (
-    BATTERY,
-    DEMAND,
-    FRICTION,
-    SPEED,
-    WHEELS,
-    BatteryReading,
-    JointReading,
-    SpeedReading,
-)
 from iwm_power_manager.control.persistence import SAMPLE_S
-from iwm_power_manager.control.record import (
-    DECIDED,
-    DECIDED_NAMES,
-    SETTINGS,
-    SIGNAL_NAMES,
-    command_of,
-    completed,
-    from_numbers,
-    measurement_of,
-    step_of,
-)
 from iwm_power_manager.control.repeat import repeat
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.stepping import AsRecorded, Lockstep, Taken
@@ -54,15 +33,17 @@ from iwm_power_manager.signals.readings import DemandReading, FrictionReading, j
 
 #: What each kind of reading is to the controller.
 _TOPICS = {
-    SpeedReading: SPEED,
-    JointReading: WHEELS,
-    BatteryReading: BATTERY,
-    DemandReading: DEMAND,
-    FrictionReading: FRICTION,
+    monitor.SpeedReading: monitor.SPEED,
+    monitor.JointReading: monitor.WHEELS,
+    monitor.BatteryReading: monitor.BATTERY,
+    DemandReading: monitor.DEMAND,
+    FrictionReading: monitor.FRICTION,
 }
+#: Those of a lock-step set that carry a stamp.
+_SETS = {monitor.SPEED: lockstep.SPEED, monitor.WHEELS: lockstep.WHEELS, monitor.BATTERY: lockstep.BATTERY}
 #: Where these stand among a record's numbers, and torques and heat indices among those the law decides.
-_FRICTION, _DT, _LOST = map(SIGNAL_NAMES.index, ("friction", "dt_s", "wheels_lost"))
-_TORQUES, _HEAT = slice(0, 8), DECIDED_NAMES.index("front_heat")
+_FRICTION, _DT, _LOST = map(record.SIGNAL_NAMES.index, ("friction", "dt_s", "wheels_lost"))
+_TORQUES, _HEAT = slice(0, 8), record.DECIDED_NAMES.index("front_heat")
 #: Memories that have given the same numbers, to within this, for so long, s, do not matter any more; a torque that is
 #: further from theirs, N m, has another reason.
 _ALIKE = 1e-6
@@ -192,11 +173,11 @@ class RecordedSteps:
         except (UnreadableError, ValueError):
             self._report.bad_messages += 1
             return False
-        if list(names) == SIGNAL_NAMES:
-            names, values = DECIDED_NAMES, values[DECIDED]
+        if list(names) == record.SIGNAL_NAMES:
+            names, values = record.DECIDED_NAMES, values[record.DECIDED]
         else:
             found = dict(zip(names, values, strict=True))
-            names = tuple(name for name in DECIDED_NAMES if name in found)
+            names = tuple(name for name in record.DECIDED_NAMES if name in found)
             values = tuple(found[name] for name in names)
         self._comparer.recorded(stamp_ns, message.log_time_ns, names, values)
         return True
@@ -204,16 +185,16 @@ class RecordedSteps:
     def _take(self, names: Sequence[str], values: Sequence[float], stamp_ns: int, message: Message) -> None:
         """Take one step's numbers; `KeyError` or `ValueError` if the message is of another kind or version."""
         plan = self._plan
-        numbers = completed(names, values)
-        number = step_of(numbers)
+        numbers = record.completed(names, values)
+        number = record.step_of(numbers)
         times = stamp_ns, message.log_time_ns, message.publish_time_ns
         if number + 1 == self._next and stamp_ns == self._stamp_ns:
             self._blocks[-1].due.append(_Due(*times, ()))
             return
-        if numbers[SETTINGS] != self._recorded:  # they rarely change
-            self._settings = from_numbers(numbers).settings._replace(**plan.changes)
-            self._recorded = numbers[SETTINGS]
-        friction = measurement_of(numbers).friction if plan.keeps_friction else plan.friction
+        if numbers[record.SETTINGS] != self._recorded:  # they rarely change
+            self._settings = record.from_numbers(numbers).settings._replace(**plan.changes)
+            self._recorded = numbers[record.SETTINGS]
+        friction = record.measurement_of(numbers).friction if plan.keeps_friction else plan.friction
         table = plan.policies.table(self._settings.strategy, friction)
         begins = number if number == 0 or number != self._next else None
         last = self._blocks[-1] if self._blocks else None
@@ -230,7 +211,7 @@ class RecordedSteps:
         for due in block.due:
             if due.numbers:
                 row = next(rows)
-                command = command_of(row[DECIDED])
+                command = record.command_of(row[record.DECIDED])
                 problem = violated_bound(command, self._plan.vehicle.params)
                 self._report.count_fault(problem)
                 self._made = None if problem else ReplayedStep(*due[:3], command, row, due.numbers)
@@ -244,10 +225,10 @@ class RecordedSteps:
             self._memories = possible_memories(self._memories[0], block.begins, recorded[0], block.table)
             self._alike_s = 0.0
         numbers = np.array(recorded)
-        numbers[:, SETTINGS] = block.settings
+        numbers[:, record.SETTINGS] = block.settings
         if not self._plan.keeps_friction:
             numbers[:, _FRICTION] = self._plan.friction
-        results = np.empty((len(self._memories), len(recorded), len(DECIDED_NAMES)))
+        results = np.empty((len(self._memories), len(recorded), len(record.DECIDED_NAMES)))
         self._memories = [
             repeat(numbers, memory, block.settings, self._plan.vehicle.params, block.table, result)
             for memory, result in zip(self._memories, results, strict=True)
@@ -255,12 +236,12 @@ class RecordedSteps:
         self._report.changed += self._changed(numbers, results)
         if all(memory == self._memories[0] for memory in self._memories):
             del self._memories[1:]
-        numbers[:, DECIDED] = results[0]
+        numbers[:, record.DECIDED] = results[0]
         return numbers.tolist()
 
     def _changed(self, numbers: FloatArray, results: FloatArray) -> int:
         """How many steps no memory explains: all have given the same for a while, and the record is another."""
-        apart_nm = np.abs(numbers[:, DECIDED] - results[0])[:, _TORQUES].max(axis=1)
+        apart_nm = np.abs(numbers[:, record.DECIDED] - results[0])[:, _TORQUES].max(axis=1)
         if len(results) == 1:
             return int(np.count_nonzero(~(apart_nm <= self._tolerance)))
         changed = 0
@@ -282,8 +263,8 @@ def possible_memories(
     new = initial_state()
     if step == 0:
         return [new]
-    m, command = measurement_of(recorded), command_of(recorded[DECIDED])
-    heats = recorded[DECIDED][_HEAT:]
+    m, command = record.measurement_of(recorded), record.command_of(recorded[record.DECIDED])
+    heats = recorded[record.DECIDED][_HEAT:]
     travel = -1.0 if m.speed_mps < 0.0 else 1.0
 
     def wheel(i: int) -> WheelState:
@@ -352,12 +333,8 @@ class ReconstructedSteps:
         report.notes += [*stream.problems, *filter(None, [standing])]
         self._in_sets = not standing and _in_sets([value for _, value in probe[:_PROBE_VALUES]])
         vehicle = plan.vehicle.params
-        limits = ControllerLimits(
-            input_limits(RECORDED, vehicle.front.wheel.radius_m, by_clock=False),
-            None,
-            supervision_limits(RECORDED),
-            actuator_limits(RECORDED),
-        )
+        judged = input_limits(RECORDED, vehicle.front.wheel.radius_m, by_clock=False)
+        limits = ControllerLimits(judged, None, supervision_limits(RECORDED), actuator_limits(RECORDED))
         table = plan.policies.table(plan.settings.strategy, plan.friction)
         self._controller = Controller(vehicle, WHEEL_NAMES, limits, plan.settings, table, plan.friction)
         self._lockstep = Lockstep(self._controller, plan.period_s)
@@ -373,13 +350,13 @@ class ReconstructedSteps:
 
     def not_believed(self) -> dict[str, dict[str, int]]:
         """Inputs that were not believed: counts by reason, by topic and wheel."""
-        monitor = self._controller.monitor
+        inputs = self._controller.monitor
         found = {
             topic: {reason.name.lower(): count for reason, count in tally.dropped.items()}
-            for topic, tally in monitor.tallies.items()
+            for topic, tally in inputs.tallies.items()
             if tally.dropped
         }
-        for (wheel, verdict), count in monitor.wheels_refused.items():
+        for (wheel, verdict), count in inputs.wheels_refused.items():
             if verdict is not WheelVerdict.ABSENT:  # that is said of the messages
                 found.setdefault(f"wheel {wheel}", {})[verdict.name.lower()] = count
         return found
@@ -413,36 +390,34 @@ class ReconstructedSteps:
         for value in values:
             reading: Any = value.reading
             topic = _TOPICS.get(type(reading))
-            if topic == FRICTION:
+            if topic == monitor.FRICTION:
                 self._friction(reading.friction, reading.stamp_ns)
             elif topic is not None:
-                content = reading.power_w if topic == DEMAND else reading
-                for taken in (self._push if self._in_sets else self._use)(topic, content, reading.stamp_ns, value):
+                content = reading.power_w if topic == monitor.DEMAND else reading
+                take = self._push if self._in_sets else self._use
+                for taken in take(topic, content, reading.stamp_ns, value.publish_time_ns):
                     self._report.count_fault(taken.fault)
                     if taken.step is not None:  # else a fault, or the same set once more
-                        times = taken.stamp_ns, value.log_time_ns, value.publish_time_ns
-                        steps.append(ReplayedStep(*times, *taken.step))
+                        steps.append(ReplayedStep(taken.stamp_ns, *value[:2], *taken.step))
         return steps
 
-    def _push(self, topic: str, content: Any, now_ns: int, value: Recorded) -> Iterable[Taken]:
+    def _push(self, topic: str, content: Any, now_ns: int, sent_ns: int) -> Iterable[Taken]:
         """Lock-step: collect a set, step when it is complete."""
-        queue = self._lockstep.queue
-        if topic == DEMAND:
-            queue.push_demand(value.publish_time_ns, content)
+        if topic == monitor.DEMAND:
+            self._lockstep.queue.push_demand(sent_ns, content)
         else:
-            kind = {SPEED: lockstep.SPEED, WHEELS: lockstep.WHEELS, BATTERY: lockstep.BATTERY}[topic]
-            queue.push(kind, now_ns, value.publish_time_ns, content)
+            self._lockstep.queue.push(_SETS[topic], now_ns, sent_ns, content)
         return self._lockstep.steps()
 
-    def _use(self, topic: str, content: Any, now_ns: int, _: Recorded) -> Iterable[Taken]:
+    def _use(self, topic: str, content: Any, now_ns: int, _: int) -> Iterable[Taken]:
         """Not in sets: keep the latest of everything, step at the wheel speeds."""
-        monitor = self._controller.monitor
-        if topic == SPEED:
-            monitor.take_speed(content, now_ns)
-        elif topic == BATTERY:
-            monitor.take_battery(content, now_ns)
-        elif topic == DEMAND:
-            monitor.take_demand(content, 0.0, now_ns)
+        inputs = self._controller.monitor
+        if topic == monitor.SPEED:
+            inputs.take_speed(content, now_ns)
+        elif topic == monitor.BATTERY:
+            inputs.take_battery(content, now_ns)
+        elif topic == monitor.DEMAND:
+            inputs.take_demand(content, 0.0, now_ns)
         elif (taken := self._recorded.step(content, now_ns)) is not None:
             return [taken]
         return []
@@ -456,11 +431,9 @@ class ReconstructedSteps:
 
 def _in_sets(probe: Sequence[Recorded]) -> bool:
     """Whether speed, wheel speeds and battery come with the same stamps, as in lock-step."""
-    stamps: dict[type, set[int]] = {SpeedReading: set(), JointReading: set(), BatteryReading: set()}
-    for value in probe:
-        if type(value.reading) in stamps:
-            if not value.stamped:
-                return False
-            stamps[type(value.reading)].add(value.reading.stamp_ns)
-    common = set.intersection(*stamps.values())
-    return len(common) > 1 and len(common) >= max(map(len, stamps.values())) - 2
+    values = [(_TOPICS.get(type(value.reading)), value) for value in probe]
+    if not all(value.stamped for topic, value in values if topic in _SETS):
+        return False
+    stamps = [{value.reading.stamp_ns for found, value in values if found == topic} for topic in _SETS]
+    common = set.intersection(*stamps)
+    return len(common) > 1 and len(common) >= max(map(len, stamps)) - 2

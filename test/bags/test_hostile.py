@@ -175,10 +175,8 @@ def test_a_data_file_is_what_its_first_bytes_say(tmp_path: Path) -> None:
 
 
 def test_a_query_that_takes_too_long_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from iwm_power_manager.bags import sqlite_source
-
-    monkeypatch.setattr(sqlite_source, "SQLITE_INSTRUCTIONS", 0)
-    monkeypatch.setattr(sqlite_source, "SQLITE_INSTRUCTIONS_PER_BYTE", 0)
+    monkeypatch.setattr(limits, "SQLITE_INSTRUCTIONS", 0)
+    monkeypatch.setattr(limits, "SQLITE_INSTRUCTIONS_PER_BYTE", 0)
     folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(20_000))
     try:
         _, damage = contents(folder)
@@ -224,9 +222,7 @@ def test_messages_of_one_time_in_chunks_of_one_message_take_linear_time(tmp_path
 def test_chunks_that_all_overlap_and_do_not_fit_into_memory_are_read_in_the_order_of_the_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from iwm_power_manager.bags import mcap_source
-
-    monkeypatch.setattr(mcap_source, "MAX_OVERLAP_BYTES", 1000)
+    monkeypatch.setattr(limits, "MAX_OVERLAP_BYTES", 1000)
     entries = [(foreign.START_NS + (i * 7919) % 1000, 1, b"\0\1\0\0" + struct.pack("<Q", i)) for i in range(1000)]
     path = foreign.write_mcap(tmp_path / "a.mcap", entries, chunk_bytes=500)
     count, damage = contents(path)
