@@ -26,7 +26,7 @@ from numba.core.types import Array
 from numba.core.types.containers import BaseNamedTuple, BaseTuple
 from numba.core.types.misc import unliteral
 
-from iwm_power_manager import kernel_cache
+from iwm_power_manager import jit, kernel_cache
 from iwm_power_manager.jit import Kernel
 from iwm_power_manager.kernel_cache import Store, UnknownSourceError
 
@@ -82,6 +82,9 @@ class Use(NamedTuple):
 #: Every entry point that this process has needed, in this order.
 USES: list[Use] = []
 
+
+#: Functions compiled in this process, by module and name.
+_COMPILED: set[str] = set()
 
 #: What kernels use of NumPy that makes no array.
 _SCALAR = frozenset({"float32", "float64", "inf", "int16", "int32", "int64", "searchsorted"})
@@ -152,6 +155,15 @@ class _Part(CPUDispatcher):
         result = result._replace(entry_point=_EntryPoint())
         self.targetctx.insert_user_function(result.entry_point, result.fndesc, [result.library])
         self.overloads[tuple(result.signature.args)] = result
+        _count(self.py_func)
+
+
+def _count(function: Any) -> None:
+    """A function is compiled."""
+    name = f"{function.__module__} {function.__qualname__}"
+    if jit.watch is not None and name not in _COMPILED:
+        jit.watch.ready()
+    _COMPILED.add(name)
 
 
 class _EntryPoint:
@@ -208,6 +220,8 @@ class _Entry(CPUDispatcher):
         finally:
             if collecting:
                 gc.enable()
+            if jit.watch is not None:
+                jit.watch.end()
 
 
 def entry_point(kernel: Kernel) -> CPUDispatcher:
@@ -290,6 +304,10 @@ class _Cache(NullCache):
                 STORE.say_damaged(file)
         if result is not None:
             USES.append(Use(self._name, file or "", True, time.perf_counter() - self._started_s[sig]))
+        elif jit.watch is not None:
+            reached = kernel_cache.reach(self._kernel.py_func, lambda value: isinstance(value, Kernel)).code
+            names = {" ".join(line.split()[:2]) for line in reached.splitlines()}
+            jit.watch.begin(self._name, len(names - _COMPILED))
         return result
 
     def save_overload(self, sig: Any, data: CompileResult) -> None:

@@ -18,7 +18,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -27,6 +27,23 @@ F = TypeVar("F", bound=Callable[..., Any])
 STARTED_NS = time.time_ns() - 20_000_000
 
 _BUILDING = threading.RLock()
+
+
+class Watch(Protocol):
+    """Hears of each kernel that has to be compiled for a call from Python."""
+
+    def begin(self, kernel: str, functions: int) -> None:
+        """Compiling begins; so many functions are compiled for it."""
+
+    def ready(self) -> None:
+        """One of them is."""
+
+    def end(self) -> None:
+        """It is compiled, or was found to be no good."""
+
+
+#: Whoever shows the user what is being compiled.
+watch: Watch | None = None
 
 
 class Kernel:

@@ -249,11 +249,6 @@ def _is_private(folder: Path) -> bool:
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022
 
 
-def is_empty() -> bool:
-    """Whether nothing has been compiled for this user yet."""
-    return not any((place.folder / KERNELS).is_dir() for place in places())
-
-
 class Store:
     """Files by name in the first folder that takes them; what is wrong is said once and never raised."""
 

@@ -74,10 +74,13 @@ def environment(path: Path, cache: Path) -> dict[str, str]:
     return {**keep, "PYTHONPATH": f"{path}{os.pathsep}{ROOT}", "IWM_CACHE_DIR": str(cache)}
 
 
-def run(path: Path, cache: Path, prefix: tuple[str, ...] = (), **variables: str) -> tuple[str, str]:
+SHOWN = "from iwm_power_manager.tools.progress import show_compiling; show_compiling()\n"
+
+
+def run(path: Path, cache: Path, prefix: tuple[str, ...] = (), before: str = "", **variables: str) -> tuple[str, str]:
     """Call the toy's kernel in a process of its own: result and whether it was found, and what was said."""
     done = subprocess.run(
-        [*prefix, sys.executable, "-B", "-c", RUN],
+        [*prefix, sys.executable, "-B", "-c", before + RUN],
         env={**environment(path, cache), **variables}, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -101,6 +104,13 @@ def test_a_kernel_is_compiled_again_after_an_edit_to_what_it_imports_and_to_noth
 
     source.write_text(source.read_text().replace("20.0", "10.0"))
     assert run(toy, cache)[0] == "60.5 True"
+
+
+def test_a_command_says_that_it_compiles_and_nothing_where_it_need_not(toy, tmp_path) -> None:
+    result, said = run(toy, tmp_path / "cache", before=SHOWN)
+    assert result == "60.5 False"
+    assert said.splitlines()[0].startswith("compiling for this machine")
+    assert run(toy, tmp_path / "cache", before=SHOWN) == ("60.5 True", "")
 
 
 def test_fields_that_change_places_in_a_module_the_kernel_does_not_import_make_another_kernel(toy, tmp_path) -> None:

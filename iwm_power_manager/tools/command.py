@@ -36,8 +36,11 @@ def made_with(
     return ", ".join(parts)
 
 
-def ended(name: str, work: Callable[[], int | None]) -> int:
-    """Exit code of a command's work; what is wrong with the user's input is one line."""
+def ended(name: str, work: Callable[[], int | None], *, quiet: bool = False) -> int:
+    """Exit code of a command's work; what is wrong with the user's input is one line, and compiling is shown."""
+    from iwm_power_manager.tools.progress import show_compiling
+
+    show_compiling(quiet=quiet)
     try:
         return work() or DONE
     except IwmError as error:

@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from typing import Any
 
 from tqdm import tqdm
 
-#: A log gets a line at each tenth, but none sooner than so long after the last.
-_STEPS, _LEAST_S = 10, 5.0
+from iwm_power_manager import jit
+
+#: A log gets a line at each tenth, but none sooner than so long after the last; and one when nothing has moved so long.
+_STEPS, _LEAST_S, _MOST_S = 10, 5.0, 30.0
 
 
 class Bar(tqdm):  # type: ignore[type-arg]
@@ -46,8 +49,47 @@ class Bar(tqdm):  # type: ignore[type-arg]
             super().refresh(*args, **kwargs)
             return
         now_s, step = time.monotonic(), int(_STEPS * self.n / self.total) if self.total else 0
-        if step > self._step and now_s >= self._said_s + _LEAST_S:
+        if now_s >= self._said_s + (_LEAST_S if step > self._step else _MOST_S):
             self._said_s, self._step = now_s, step
             label = f"{self.desc}: " if self.desc else ""
             took = self.format_interval(now_s - self._begun_s)
             print(f"{label}{self.n:.0f} of {self.total:.0f} {self.unit} in {took}", file=sys.stderr, flush=True)
+
+
+class _Compiling:
+    """A bar for each kernel that is compiled, alive until the last of it is optimised."""
+
+    def __init__(self) -> None:
+        self._said = False
+        self._bar: Bar | None = None
+        self._over = threading.Event()
+
+    def begin(self, kernel: str, functions: int) -> None:
+        """Show it; the first time, why there is something to wait for."""
+        if not self._said:
+            tqdm.write("compiling for this machine: a minute or some, once after an installation or update", sys.stderr)
+        self._said = True
+        self._bar, self._over = Bar(functions, "functions", f"compiling {kernel.split('.', 1)[-1]}"), threading.Event()
+        threading.Thread(target=_keep_alive, args=(self._bar, self._over), daemon=True).start()
+
+    def ready(self) -> None:
+        """One more function."""
+        if self._bar is not None:
+            self._bar.update()
+
+    def end(self) -> None:
+        """Take it away."""
+        self._over.set()
+        if self._bar is not None:
+            self._bar.close()
+        self._bar = None
+
+
+def _keep_alive(bar: Bar, over: threading.Event) -> None:
+    while not over.wait(1.0):
+        bar.refresh()
+
+
+def show_compiling(*, quiet: bool = False) -> None:
+    """Tell the user from now on what is compiled, and how far that is."""
+    jit.watch = None if quiet else _Compiling()

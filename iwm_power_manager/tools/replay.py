@@ -71,7 +71,7 @@ def main(args: Sequence[str] | None = None) -> int:
         with BagReader(options.bag) as bag:
             return _replay(bag, options) if options.what_if is None else _what_if(bag, options)
 
-    return ended("replay", work)
+    return ended("replay", work, quiet=options.quiet)
 
 
 def _parser() -> argparse.ArgumentParser:

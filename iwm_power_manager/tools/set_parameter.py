@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -24,6 +25,7 @@ _TRANSITIONS = {
     "shutdown": "finalized",
 }
 _LOOK_S = 0.05
+_OUT_OF_RANGE = r"\3 is out of range; allowed: \1 to \2"
 
 
 class _Remote:
@@ -42,7 +44,10 @@ class _Remote:
             self._clients[service] = self._node.create_client(kind, f"{self._name}/{service}")
         if not self._clients[service].wait_for_service(self._patience_s):
             what = "no such node" if "parameters" in service else "no such node with a lifecycle"
-            raise FailedError(f"{self._name}: {what} on this domain within {self._patience_s:g} s")
+            found = (f"{space.rstrip('/')}/{name}" for name, space in self._node.get_node_names_and_namespaces())
+            others = ", ".join(sorted({name for name in found if name.endswith("/power_manager")} - {self._name}))
+            there = f"; there is {others}: name it with --node" if others else ""
+            raise FailedError(f"{self._name}: {what} on this domain within {self._patience_s:g} s{there}")
         return self._clients[service]
 
     def _until(self, look: Callable[[], Any]) -> Any:
@@ -78,7 +83,7 @@ class _Remote:
         """Set parameters, each NAME=VALUE in YAML; print what they were and are, or `IwmError` with the reason."""
         from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
         from rcl_interfaces.srv import SetParameters
-        from rclpy.parameter import get_parameter_value
+        from rclpy.parameter import get_parameter_value, parameter_value_to_python
 
         given = {}
         for assignment in assignments:
@@ -90,6 +95,8 @@ class _Remote:
         parameters = []
         for name, text in given.items():
             value = get_parameter_value(text)
+            if type(now[name]) in (int, float) and not isinstance(parameter_value_to_python(value), int | float):
+                raise ParameterError(f"{name}: {text!r} is no number")
             if isinstance(now[name], float) and value.type == ParameterType.PARAMETER_INTEGER:
                 value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=float(value.integer_value))
             parameters.append(Parameter(name=name, value=value))
@@ -97,6 +104,8 @@ class _Remote:
         for parameter, result in zip(parameters, results, strict=True):
             if not result.successful:
                 reason = result.reason.removeprefix(f"{parameter.name}: ") or "refused"
+                # As rclpy says it of a range that it checks itself.
+                reason = re.sub(r".* out of range Min: (.*), Max: (.*), value: (.*)", _OUT_OF_RANGE, reason)
                 raise FailedError(f"{self._name}: {parameter.name}: {reason}")
         for name, value in self.values(list(given)).items():
             print(f"{name}: {now[name]} -> {value}")

@@ -141,7 +141,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
-    return ended("solve_policy", lambda: _check(options) if options.check else _solve(options))
+    return ended("solve_policy", lambda: _check(options) if options.check else _solve(options), quiet=options.quiet)
 
 
 #: What --check takes beside the files.

@@ -172,7 +172,9 @@ def in_words(values: Mapping[str, float]) -> list[str]:
     limits = binding_limits(int(values["limits"]), values["motor_factor"])
     missing = [name for bit, name in STALE_NAMES.items() if int(values["stale"]) & bit]
     speed = f"speed {values['speed_mps']:.2f} m/s"
-    if int(values.get("doubted", 0.0)) & 1 << len(WHEEL_NAMES):
+    if "vehicle_speed" in missing:
+        speed = f"speed not known (last {values['speed_mps']:.2f} m/s)"
+    elif int(values.get("doubted", 0.0)) & 1 << len(WHEEL_NAMES):
         speed = f"speed {values['estimated_speed_mps']:.2f} m/s (sensor not believed: {values['speed_mps']:.2f} m/s)"
     return [
         f"mode: {MODE_NAMES[int(values['mode'])]}",

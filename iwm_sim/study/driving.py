@@ -11,7 +11,6 @@ from typing import Any
 
 from tqdm import tqdm
 
-from iwm_power_manager import kernel_cache
 from iwm_power_manager.tools.progress import Bar
 from iwm_sim.cluster import on_all_cores
 from iwm_sim.study import cases
@@ -28,10 +27,8 @@ _WORTH_A_PROCESS_S = 5.0
 _WARM_UP_S = 0.1
 
 
-def warm_up(wanted: Sequence[Case], say: Callable[[str], None]) -> None:
+def warm_up(wanted: Sequence[Case]) -> None:
     """Compile in this process what the workers will then find in the cache, instead of each compiling the same."""
-    if kernel_cache.is_empty():
-        say("compiling the model; this is done once and takes a minute")
     seen = set()
     for case in wanted:
         kind = (case.strategy in POLICY_STRATEGIES, case.strategy == "preview")

@@ -84,7 +84,7 @@ def study(
     for name in VARIANTS:
         for key in keys():
             policies.of_variant(name, *key)
-    warm_up(_warming(policies, cycles[0]), say)
+    warm_up(_warming(policies, cycles[0]))
     with Bar(1, "runs", quiet=quiet) as bar:
         rules = fitted_rules(vehicle, keys(), jobs)
         plan = whole(policies, cycles, rules)

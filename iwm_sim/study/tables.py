@@ -4,16 +4,29 @@
 from __future__ import annotations
 
 import itertools
+import shutil
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
 from iwm_power_manager.tools.command import made_with
-from iwm_sim.study.report import Column
-from iwm_sim.study.rows import Row, policy_text
+from iwm_sim.study.names import REFERENCE
+from iwm_sim.study.report import Column, format_value
+from iwm_sim.study.rows import Place, Row, policy_text
+
+
+def screen() -> int:
+    """Columns of the terminal; 100 where the output goes elsewhere."""
+    return shutil.get_terminal_size((100, 24)).columns
+
+
+def _strategy(row: Row) -> str:
+    """Its name; how it was driven stands above the table."""
+    return row.label.partition(", ")[0]
 
 
 def _trace(row: Row) -> str:
-    return "held" if row.metrics.trace_held else f"lost by {row.metrics.trace_excess_mps:.2f}"
+    return "held" if row.metrics.trace_held else f"lost {row.metrics.trace_excess_mps:.2f}"
 
 
 def _saving(row: Row) -> float | str | None:
@@ -26,42 +39,57 @@ def _possible(row: Row) -> float | None:
 
 
 def _period(row: Row) -> Any:
-    return row.made_with["settings"]["decision_period_s"]
+    """Decision period, s; equal split decides nothing."""
+    return None if row.strategy == REFERENCE else row.made_with["settings"]["decision_period_s"]
 
 
 #: Columns of the results of `evaluate`.
 COLUMNS: tuple[Column[Row], ...] = (
-    Column("strategy", lambda row: row.label),
-    Column("Wh/km", lambda row: row.metrics.wh_per_km, decimals=2),
-    Column("ΔSoC %", lambda row: row.metrics.delta_soc_percent, decimals=3),
-    Column("saving %", _saving, decimals=2),
-    Column("% of possible", _possible, decimals=0),
-    Column("changes/min", lambda row: row.metrics.share_changes_per_min, decimals=1),
-    Column("rms error m/s", lambda row: row.metrics.rms_speed_error_mps, decimals=3),
-    Column("max error m/s", lambda row: row.metrics.max_speed_error_mps, decimals=2),
-    Column("min slip", lambda row: row.metrics.min_slip, decimals=3),
-    Column("max slip", lambda row: row.metrics.max_slip, decimals=3),
-    Column("locked s", lambda row: row.metrics.locked_s, decimals=2),
-    Column("trace", _trace),
-    Column("decides every s", _period, decimals=2),
-    Column("policy", policy_text),
+    Column("strategy", _strategy),
+    Column("used", lambda row: row.metrics.wh_per_km, "Wh/km", 2, group="energy"),
+    Column("ΔSoC", lambda row: row.metrics.delta_soc_percent, "%", 3, group="energy"),
+    Column("saving", _saving, "%", 2, group="energy"),
+    Column("of possible", _possible, "%", 0, group="energy"),
+    Column("changes", lambda row: row.metrics.share_changes_per_min, "1/min", 1, group="split"),
+    Column("rms", lambda row: row.metrics.rms_speed_error_mps, "m/s", 3, group="speed error"),
+    Column("max", lambda row: row.metrics.max_speed_error_mps, "m/s", 2, group="speed error"),
+    Column("min", lambda row: row.metrics.min_slip, decimals=3, group="slip"),
+    Column("max", lambda row: row.metrics.max_slip, decimals=3, group="slip"),
 )
+#: Columns only where the rows of a place differ; what is the same in all of them stands once above them.
+_LOCKED = Column[Row]("locked", lambda row: row.metrics.locked_s, "s", 2)
+_TRACE = Column[Row]("trace", _trace)
+_DECIDES = Column[Row]("decides every", _period, "s")
+_POLICY = Column[Row]("policy", policy_text)
+#: A blank at which no line ends.
+_TOGETHER = "\u00a0"
 
 
-def text_table(rows: Sequence[Row], columns: Sequence[Column[Row]] = COLUMNS) -> str:
-    """A plain-text table, with a heading where idle drive, cycle or friction change."""
-    cells = [[column.shown(row) for column in columns] for row in rows]
-    head = [column.label for column in columns]
-    widths = [max(len(line[i]) for line in [head, *cells]) for i in range(len(columns))]
-    lines = []
-    before = None
-    for row, line in zip(rows, cells, strict=True):
-        if row.place != before:
-            before = row.place
-            how = made_with(f"{before.friction:g}", before.idle_drive, 1.0 / row.made_with["dt_s"])
-            lines += ["", f"{before.cycle}, {how}", _aligned(head, widths, columns)]
-        lines.append(_aligned(line, widths, columns))
-    return "\n".join(lines[1:])
+def text_table(rows: Sequence[Row], width: int) -> str:
+    """A plain-text table for each place, under what its rows have in common; wider than `width`, it goes on below."""
+    parts = []
+    for place, found in itertools.groupby(rows, lambda row: row.place):
+        own = list(found)
+        apart = [column for column in (_LOCKED, _TRACE, _DECIDES, _POLICY) if len(_said(column, own)) > 1]
+        parts += [*_heading(place, own, width), plain_table(own, (*COLUMNS, *apart), width), ""]
+    return "\n".join(parts[:-1])
+
+
+def _said(column: Column[Row], rows: Sequence[Row]) -> list[str]:
+    """What a column shows, each once."""
+    return [text for text in dict.fromkeys(map(column.shown, rows)) if text not in ("", format_value(None, None))]
+
+
+def _heading(place: Place, rows: Sequence[Row], width: int) -> list[str]:
+    """What all rows of a place have in common, and what is said of a single one beside its name."""
+    same = {column: said[0] for column in (_LOCKED, _TRACE, _DECIDES, _POLICY) if len(said := _said(column, rows)) == 1}
+    law = float(same.get(_DECIDES, 0.0)), [same.get(_POLICY, "").replace(" ", _TOGETHER)]
+    how = made_with(f"{place.friction:g}", place.idle_drive, 1.0 / rows[0].made_with["dt_s"], *law)
+    lines = [f"{place.cycle}, {how}".replace("policy ", f"policy{_TOGETHER}")]
+    lines += [row.label.replace(", ", ": ", 1) for row in rows if ", " in row.label]
+    shared = [f"{column.label} {same[column]} {column.unit}".rstrip() for column in (_LOCKED, _TRACE) if column in same]
+    lines += [f"every row: {', '.join(shared)}"] if shared else []
+    return [part.replace(_TOGETHER, " ") for line in lines for part in textwrap.wrap(line, width)]
 
 
 def plain_table[R](rows: Sequence[R], columns: Sequence[Column[R]], width: int = 0) -> str:

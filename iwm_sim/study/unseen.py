@@ -157,7 +157,8 @@ KIND_COLUMNS: tuple[Column[Kind], ...] = (
 )
 
 
-def _kind(label: str) -> str:
+def kind_of(label: str) -> str:
+    """Kind of a cell, by its label."""
     parts = label.split(", ")  # car, cycle, friction, and of a logged one more
     return "drawn cars" if label.startswith("car ") else f"{parts[0]}, {'logged' if len(parts) > 3 else parts[-1]}"
 
@@ -169,7 +170,7 @@ def kinds(frontiers: Sequence[Frontier]) -> list[Kind]:
         for point in f.ours:
             value = margin(point, f.rivals, COUNTS[0])
             if value is not None and point.saving_percent is not None:
-                for name in (_kind(f.label), "all"):
+                for name in (kind_of(f.label), "all"):
                     by_name.setdefault(name, []).append((point.saving_percent, value))
     found = []
     for name in sorted(by_name, key=lambda name: (name == "all", name)):
@@ -185,7 +186,7 @@ def report(frontiers: Sequence[Frontier], worst: int = 10) -> str:
     lost = sum(not point.held for f in frontiers for point in f.ours)
     lines = [
         f"{len(frontiers)} cells, {lost} of them without a held trace or an equal split that held it",
-        _made_with(frontiers),
+        common(frontiers),
     ]
     lines += [
         f"{verdict.counted}: {verdict.cells} cells, margin mean {verdict.mean:+.3f}, lowest twentieth below "
@@ -208,7 +209,7 @@ def report(frontiers: Sequence[Frontier], worst: int = 10) -> str:
     return "\n".join(lines)
 
 
-def _made_with(frontiers: Sequence[Frontier]) -> str:
+def common(frontiers: Sequence[Frontier]) -> str:
     """What all cells have in common, with the policies; of drawn cars, which have some each, their number."""
     common = dict.fromkeys(f.made_with.partition(", ")[2] for f in frontiers)
     drawn = {(f.label.startswith("car "), point.policy) for f in frontiers for point in f.ours}

@@ -12,14 +12,14 @@ import dataclasses
 import json
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
-from iwm_power_manager import files, kernel_cache
+from iwm_power_manager import files
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES, drivable
@@ -28,6 +28,7 @@ from iwm_power_manager.exit_codes import DONE, FAILED, INTERRUPTED
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.tools import command
 from iwm_power_manager.tools.options import number
+from iwm_power_manager.tools.progress import show_compiling
 from iwm_sim import metrics
 from iwm_sim.closed_loop import Run
 from iwm_sim.dds_drive import REFERENCE, Loaded, Outcome, Plan, closed_loop_run, compare, drive_over_dds, load
@@ -35,13 +36,14 @@ from iwm_sim.processes import ChildError
 from iwm_sim.road_report import text
 from iwm_sim.road_run import checked_run
 from iwm_sim.scenario import load_scenario
-from iwm_sim.study.drive_page import Driven, DriveRow, drive_page, row
-from iwm_sim.study.report import format_value as shown
+from iwm_sim.study.drive_page import COLUMNS, Driven, drive_page, row
 from iwm_sim.study.report import write_page
+from iwm_sim.study.tables import plain_table, screen
+from iwm_sim.tools.precompile import compile_for_a_drive
 
-_LOCK_STEP = "over DDS, lock-step"
-_REAL_TIME = "over DDS, real time"
-_ONE_PROCESS = "in one process"
+_LOCK_STEP = "over DDS"
+_REAL_TIME = "in real time"
+_ONE_PROCESS = "one process"
 
 
 # --- command line ---------------------------------------------------------------------------------------------------
@@ -143,6 +145,7 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; returns the exit code."""
     plan = parse(arguments)
+    show_compiling()
     for wanted in (signal.SIGINT, signal.SIGTERM):
         signal.signal(wanted, _terminated)
     try:
@@ -174,8 +177,7 @@ def run(plan: Plan) -> int:
     _make_output(plan)
     vehicle = loaded.vehicle
     print(f"{vehicle.name} on {loaded.cycle.name}, friction {plan.friction:g}, idle drive {vehicle.idle_drive}")
-    if kernel_cache.is_empty():
-        print("compiling the vehicle model; this is done once and takes a minute")
+    compile_for_a_drive()
     alone = closed_loop_run(plan, loaded)
     reference = closed_loop_run(plan, loaded, equal=True)
 
@@ -197,6 +199,7 @@ def run_scenario(plan: Plan) -> int:
     load(plan)
     _make_output(plan)
     print(f"{scenario.name}: {scenario.about}")
+    compile_for_a_drive()
     outcome = drive_over_dds(plan, scenario.name)
     result = checked_run(scenario, outcome.run, default_settings(plan.strategy))
     print(f"\n{text(result)}")
@@ -240,11 +243,7 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
     stored = json.dumps(content, indent=1, allow_nan=False).encode() + b"\n"
     for path in filter(None, (plan.output / "result.json", plan.json)):
         files.atomic_write(path, stored)
-    print()
-    for line in table(rows):
-        print(line)
-    print()
-    print(made_with(plan, loaded))
+    print(f"\n{plain_table(rows, COLUMNS, screen())}\n\n{made_with(plan, loaded)}")
     for remark in remarks:
         print(remark)
     if plan.record:
@@ -286,31 +285,6 @@ def described(plan: Plan, loaded: Loaded, notes: Mapping[str, Any]) -> dict[str,
         "command time-outs": notes["command_timeouts"],
         "recorded": plan.record,
     }
-
-
-def table(rows: Sequence[DriveRow]) -> list[str]:
-    """Lines of the table on the terminal."""
-    columns: tuple[tuple[str, str, Callable[[DriveRow], str]], ...] = (
-        ("strategy", "", lambda r: r.strategy),
-        ("distance", "km", lambda r: shown(r.metrics.distance_m / 1000.0, 3)),
-        ("energy", "Wh/km", lambda r: shown(r.metrics.wh_per_km, 2)),
-        ("ΔSoC", "%", lambda r: shown(r.metrics.delta_soc_percent, 3)),
-        ("saving", "%", lambda r: shown(r.saving_percent, 2)),
-        ("speed error", "m/s rms", lambda r: shown(r.metrics.rms_speed_error_mps, 3)),
-        ("slip", "", lambda r: f"{shown(r.metrics.min_slip, 3)}..{shown(r.metrics.max_slip, 3)}"),
-        ("share changes", "1/min", lambda r: shown(r.share_changes_per_min, 1)),
-        ("trace", "", lambda r: "held" if r.metrics.trace_held else "LOST"),
-        ("run", "", lambda r: r.made),
-    )
-    cells = [[name for name, _, _ in columns], [unit for _, unit, _ in columns]]
-    cells += [[value(r) for _, _, value in columns] for r in rows]
-    widths = [max(len(line[i]) for line in cells) for i in range(len(columns))]
-    left = (0, len(columns) - 1)
-    lines = []
-    for line in cells:
-        padded = [text.ljust(widths[i]) if i in left else text.rjust(widths[i]) for i, text in enumerate(line)]
-        lines.append("  ".join(padded).rstrip())
-    return [*lines[:2], "-" * max(map(len, lines)), *lines[2:]]
 
 
 if __name__ == "__main__":

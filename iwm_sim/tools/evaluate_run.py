@@ -33,17 +33,14 @@ from iwm_sim.study.policies import PolicySource
 from iwm_sim.study.rows import Row, rows_of
 from iwm_sim.study.study_figures import battery_figure
 from iwm_sim.study.study_tables import ABLATION_NOTE, TABLES
-from iwm_sim.study.tables import plain_table, text_table
+from iwm_sim.study.tables import plain_table, screen, text_table
 from iwm_sim.study.variants import VARIANTS
+from iwm_sim.tools.precompile import compile_for_a_drive
 
 
 def run(mode: str, options: argparse.Namespace) -> None:
     """Do what is asked for; `mode` is a key of `evaluate.MODES`, or "" for single cases."""
     _RUN[mode](options)
-
-
-#: Columns of a wide terminal.
-SCREEN = 120
 
 
 # --- cases ----------------------------------------------------------------------------------------------------------
@@ -58,13 +55,13 @@ def _evaluate(options: argparse.Namespace) -> None:
     for line in _doubts(wanted):
         say(f"evaluate: {line}")
     with Progress(len(wanted), options.quiet) as progress:
-        warm_up(wanted, say)
+        warm_up(wanted)
         wanted = with_rules(wanted, options.jobs)
         drive = _Saving(options.save_series) if options.save_series else cases.result
         results = drive_all(wanted, options.jobs, progress.done, drive)
     rows = rows_of(results)
     if not options.quiet:
-        print(text_table(rows))
+        print(text_table(rows, screen()))
         for line in remarks(rows):
             print(line)
         say(f"{len(rows)} cases in {time.perf_counter() - started:.1f} s")
@@ -233,7 +230,7 @@ def _paper(options: argparse.Namespace) -> None:
     if not options.quiet:
         for table in tables:
             title = table.title if table.section == TABLES else f"{table.section}: {table.title}"
-            print(f"{title}\n{plain_table(table.rows, table.columns, SCREEN)}\n")
+            print(f"{title}\n{plain_table(table.rows, table.columns, screen())}\n")
         print(f"{table.note}\n{_policies_text(policies)}")
     if options.json:
         rows = [row.to_json() for table in tables for cell in table.rows for row in cell.values()]
@@ -267,7 +264,7 @@ def _ablation(options: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory(prefix="iwm-ablation-") as folder:
         rows = ablation.ablation(policies, Path(folder), options.jobs, say, quiet=options.quiet)
     if not options.quiet:
-        print(f"{plain_table(rows, ablation.columns(rows))}\n{ABLATION_NOTE}\n{_policies_text(policies)}")
+        print(f"{plain_table(rows, ablation.columns(rows), screen())}\n{ABLATION_NOTE}\n{_policies_text(policies)}")
     if options.json:
         content = {"package_version": __version__, "rows": [dataclasses.asdict(row) for row in rows]}
         write_json(options.json, content)
@@ -335,7 +332,7 @@ def _frontier(options: argparse.Namespace) -> None:
 
 
 def _show_frontier(made: frontier.Frontier, picture: Path) -> None:
-    print(f"{made.label}, {made.made_with}\n{plain_table(made.points, frontier.POINT_COLUMNS)}")
+    print(f"{made.label}, {made.made_with}\n{plain_table(made.points, frontier.POINT_COLUMNS, screen())}")
     print("moves/min: sum of all moves, 1 being all the power; preview: the bound, the whole drive known in advance")
     print(f"picture: {picture}\n")
 
@@ -349,6 +346,7 @@ def _unseen(options: argparse.Namespace) -> None:
     say = silent if options.quiet else tell
     started = time.perf_counter()
     say(f"{len(wanted)} cells from seed {options.seeds} on; policies for cars of their own are solved first")
+    compile_for_a_drive()
     with Bar(len(wanted), "cells", quiet=options.quiet) as bar:
         made = on_all_cores(unseen.drive_cell, wanted, options.jobs, lambda _: bar.update())
     write_json(folder / "unseen.json", unseen.to_json(made))

@@ -121,6 +121,7 @@ def _run(options: argparse.Namespace) -> None:
     from iwm_sim.fleet.store import Store
     from iwm_sim.fleet.task import Drive, Road, Solve
     from iwm_sim.study.driving import silent, tell
+    from iwm_sim.tools.precompile import compile_for_a_drive
 
     parts: list[tuple[type[Any], Sequence[Any]]] = [(Solve, plan.solves)]
     if options.command == "drive":
@@ -131,6 +132,8 @@ def _run(options: argparse.Namespace) -> None:
     say: Callable[[str], None] = silent if options.quiet else tell
     store = Store(options.output)
     made = {}
+    if plan.drives and not options.scheduler:
+        compile_for_a_drive()
     with runner(store, plan.files, options.scheduler, options.jobs, options.batch) as running:
         running.check_workers(say)
         for kind, tasks in parts:
@@ -185,7 +188,7 @@ def _work(options: argparse.Namespace) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     options = parser().parse_args(argv)
-    return ended("fleet", lambda: _work(options))
+    return ended("fleet", lambda: _work(options), quiet=getattr(options, "quiet", False))
 
 
 if __name__ == "__main__":

@@ -138,11 +138,9 @@ def test_the_bag_opens_with_mcaps_reader_and_has_schemas_and_simulated_time(fini
 
 def test_the_table_shows_the_policy_beside_equal_distribution(finished) -> None:
     lines = finished.output.splitlines()
-    (head,) = (number for number, line in enumerate(lines) if line.startswith("strategy "))
-    assert lines[head + 3].startswith(STRATEGY)
-    assert lines[head + 3].endswith("over DDS, lock-step")
-    assert lines[head + 4].startswith("equal")
-    assert lines[head + 4].endswith("in one process")
+    for name, made in ((STRATEGY, "over DDS"), ("equal", "one process")):
+        assert any(line.startswith(name) and line.endswith(made) for line in lines)
+    assert all(len(line) <= 100 for line in lines if line.startswith(("Strategy", STRATEGY, "equal")))
 
 
 def test_the_result_is_there_as_json(finished) -> None:

@@ -13,24 +13,62 @@ MADE = {"dt_s": 0.01, "settings": {"decision_period_s": 0.02}}
 ROW = Row(Place("nycc", 0.9, "none"), "sdp", "sdp", METRICS, -1.456, None, True, MADE)
 
 
-def test_each_group_has_its_heading_once():
-    rows = [ROW, replace(ROW, label="equal"), replace(ROW, place=Place("nycc", 0.2, "none"))]
-    text = text_table(rows)
+def of(label, **changes):
+    made = MADE | changes.pop("made", {})
+    return replace(ROW, label=label, strategy=label.partition(",")[0], made_with=made, **changes)
+
+
+def test_each_place_has_its_heading_once():
+    rows = [of("sdp"), of("equal"), of("sdp", place=Place("nycc", 0.2, "none"))]
+    text = text_table(rows, 100)
     assert text.count("nycc, friction 0.9, idle drive none, control at 100 Hz") == 1
     assert text.count("nycc, friction 0.2, idle drive none") == 1
     assert "104.46" in text
     assert "−1.46" in text
 
 
+def test_what_all_rows_share_stands_above_them_and_what_differs_in_columns():
+    coupled = {"policy_grid": "coupled", "policy_checksum": "f850ca447570"}
+    lookahead = of("sdp_lookahead", made=coupled)
+    shared = text_table([of("equal"), lookahead], 100)
+    assert "split decided every 0.02 s,\npolicy coupled f850ca44\n" in shared
+    assert "every row: locked 0.00 s, trace held" in shared
+    assert not {"decides", "policy", "trace", "locked"} & set(shared.splitlines()[4].split())
+    printed = {"policy_grid": "paper", "policy_checksum": "cf1c7eae0000", "settings": {"decision_period_s": 0.1}}
+    lost = METRICS._replace(trace_held=False, trace_excess_mps=1.25, locked_s=2.5)
+    apart = text_table([of("equal"), lookahead, of("paper_sdp", made=printed, metrics=lost)], 1000)
+    assert "every" not in apart.splitlines()[0]
+    *_, equal, ours, papers = map(str.split, apart.splitlines())
+    assert equal[-3:] == ["0.00", "held", "–"]
+    assert ours[-5:] == ["0.00", "held", "0.02", "coupled", "f850ca44"]
+    assert papers[-6:] == ["2.50", "lost", "1.25", "0.1", "paper", "cf1c7eae"]
+
+
+def test_how_a_single_strategy_was_driven_stands_above_the_table():
+    text = text_table([of("equal"), of("preview, at most 7 changes a minute, or none")], 100)
+    assert "\npreview: at most 7 changes a minute, or none\n" in text
+    assert text.splitlines()[-1].split()[:2] == ["preview", "104.46"]
+
+
+def test_no_line_is_wider_than_the_screen():
+    rows = [
+        of("instantaneous_slip", made={"policy_grid": "coupled", "policy_checksum": f"{k:012}"}, metrics=metrics)
+        for k, metrics in enumerate([METRICS, METRICS._replace(trace_held=False, trace_excess_mps=12.3, min_slip=-0.1)])
+    ]
+    for width in (60, 80, 100):
+        assert max(map(len, text_table(rows, width).splitlines())) <= width
+        assert "lost 12.30" in text_table(rows, width)
+
+
 def test_numbers_stand_below_each_other():
-    lines = text_table([ROW, replace(ROW, metrics=METRICS._replace(wh_per_km=9.5))]).splitlines()[2:]
+    lines = text_table([ROW, replace(ROW, metrics=METRICS._replace(wh_per_km=9.5))], 100).splitlines()[-2:]
     assert lines[0].index("104.46") + len("104.46") == lines[1].index("9.50") + len("9.50")
 
 
 def test_a_lost_trace_and_another_distance_are_marked():
     lost = METRICS._replace(trace_held=False, trace_excess_mps=1.25)
-    text = text_table([replace(ROW, metrics=lost, same_distance_as_equal=False)])
-    assert "lost by 1.25" in text
+    text = text_table([replace(ROW, metrics=lost, same_distance_as_equal=False)], 100)
+    assert "trace lost 1.25" in text
     assert "distance" in text
     assert "−1.46" not in text
 

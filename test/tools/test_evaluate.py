@@ -115,8 +115,8 @@ def test_every_result_says_what_it_was_made_with(hill, small_policy, tmp_path, c
     shown = capsys.readouterr().out
     assert "friction 0.9, idle drive none, control at 50 Hz" in shown
     assert f"small {load_policy(small_policy).checksum[:8]}" in shown
-    assert "preview, 0 J a move + 20 J for any change" in shown
-    assert shown.count("0.10") >= 3  # equal, sdp and preview decide every 0.1 s
+    assert "preview: 0 J a move + 20 J for any change" in shown
+    assert "split decided every 0.1 s" in shown
 
 
 def test_the_papers_strategy_has_a_name_a_grid_and_a_period_of_its_own(hill, small_grid, tmp_path, monkeypatch):

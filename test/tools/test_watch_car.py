@@ -59,6 +59,7 @@ def test_mode_gate_limits_and_missing_inputs_stand_in_words() -> None:
     )
     for part in ("mode: degraded", "gate: front", "regeneration, slip", "vehicle_speed, battery_state", "1.50 kW"):
         assert part in text
+    assert "speed not known (last 3.00 m/s)" in text
     assert "limits that bind: none" in in_words(values())
 
 
