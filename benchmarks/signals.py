@@ -47,11 +47,15 @@ def contenders() -> dict[str, Callable[[dict[str, bytes]], object]]:
     mapping = load_mapping()
     types = {source.topic: types_of(source.type) for sources in mapping.sources.values() for source in sources}
     readers = topic_readers(mapping, types, Assembly(WHEEL_NAMES))
-    reads = {
-        VEHICLE_SPEED: messages.read_vehicle_speed,
-        WHEEL_STATES: messages.read_wheel_speeds,
-        BATTERY_STATE: messages.read_battery_state,
-        POWER_DEMAND: messages.read_number,
+
+    def stamp(message: Any) -> int:
+        return messages.stamp_to_ns(message.header.stamp)
+
+    reads: dict[str, Callable[[Any], object]] = {
+        VEHICLE_SPEED: lambda m: (stamp(m), m.twist.linear.x),
+        WHEEL_STATES: lambda m: (stamp(m), tuple(m.name), tuple(m.velocity)),
+        BATTERY_STATE: lambda m: (stamp(m), m.percentage, m.temperature, m.voltage, -m.current),
+        POWER_DEMAND: lambda m: m.data,
     }
     in_order = [(topic, readers[topic]) for topic in _TOPICS]
     decoded = [(topic, messages.TOPIC_TYPES[topic], reads[topic]) for topic in _TOPICS]

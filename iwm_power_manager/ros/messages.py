@@ -18,14 +18,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, JointState
 from std_msgs.msg import Float64
 
-from iwm_power_manager.control.monitor import (
-    BatteryReading,
-    JointReading,
-    SpeedReading,
-)
-from iwm_power_manager.control.monitor import (
-    select_by_name as select_by_name,  # part of this interface
-)
+from iwm_power_manager.control.monitor import JointReading
+from iwm_power_manager.control.monitor import select_by_name as select_by_name  # part of this interface
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.signals.contract import *  # noqa: F403 - names of topics and wheels: part of this interface
 from iwm_power_manager.signals.contract import TYPES
@@ -68,11 +62,6 @@ def number_message(value: float) -> Float64:
     return Float64(data=value)
 
 
-def read_number(message: Float64) -> float:
-    """Value of a Float64 message."""
-    return float(message.data)
-
-
 def imu_message(stamp_ns: int, yaw_rate_radps: float, forward_mps2: float, left_mps2: float) -> Imu:
     """`imu`: what a sensor in `base_link` of a level car reads; the orientation is not measured."""
     message = Imu()
@@ -93,11 +82,6 @@ def vehicle_speed_message(stamp_ns: int, speed_mps: float, frame_id: str = "base
     message.header.frame_id = frame_id
     message.twist.linear.x = speed_mps
     return message
-
-
-def read_vehicle_speed(message: TwistStamped) -> SpeedReading:
-    """`vehicle_speed` as numbers."""
-    return SpeedReading(stamp_to_ns(message.header.stamp), float(message.twist.linear.x))
 
 
 def joint_message(
@@ -123,11 +107,6 @@ def wheel_states_message(
 ) -> JointState:
     """`wheel_states`: wheel speeds (`velocity`) and the torques actually applied (`effort`)."""
     return joint_message(stamp_ns, names, velocity=speed_radps, effort=torque_nm)
-
-
-def read_wheel_speeds(message: JointState) -> JointReading:
-    """Names and speeds (rad/s) of `wheel_states`, in the order of the message."""
-    return JointReading(stamp_to_ns(message.header.stamp), tuple(message.name), tuple(message.velocity))
 
 
 def torque_command_message(stamp_ns: int, names: Sequence[str], torque_nm: Sequence[float]) -> JointState:
@@ -167,17 +146,6 @@ def battery_state_message(
     message.power_supply_technology = BatteryState.POWER_SUPPLY_TECHNOLOGY_LIFE
     message.present = True
     return message
-
-
-def read_battery_state(message: BatteryState) -> BatteryReading:
-    """`battery_state` as numbers."""
-    return BatteryReading(
-        stamp_to_ns(message.header.stamp),
-        float(message.percentage),
-        float(message.temperature),
-        float(message.voltage),
-        -float(message.current),
-    )
 
 
 def named_numbers_message(stamp_ns: int, names: Sequence[str], values: Sequence[float]) -> JointState:

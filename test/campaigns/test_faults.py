@@ -19,6 +19,7 @@ from campaigns.witness import Look, Witness
 from iwm_power_manager.bags.writer import BagWriter
 from iwm_power_manager.ros import messages as m
 from iwm_sim.dds_drive import node_command
+from oracles import readings
 
 WHEELS = m.wheel_states_message(5, m.WHEEL_NAMES, (1.0, 2.0, 3.0, 4.0), (5.0, 6.0, 7.0, 8.0))
 
@@ -45,11 +46,11 @@ class TestTransforms:
         for freeze, stamp in ((whole, 1), (restamped, 2)):
             list(freeze(speed(1, 7.0), 0.0))
             (frozen,) = freeze(speed(2, 8.0), 0.1)
-            assert m.read_vehicle_speed(frozen) == (stamp, 7.0)
+            assert readings.vehicle_speed(frozen) == (stamp, 7.0)
 
     def test_a_tenfold_rate_sends_ten_with_rising_stamps(self) -> None:
         sent = list(relay.repeat(10)(speed(100, 7.0), 0.0))
-        stamps = [m.read_vehicle_speed(message).stamp_ns for message in sent]
+        stamps = [readings.vehicle_speed(message).stamp_ns for message in sent]
         assert len(set(stamps)) == 10
         assert stamps == sorted(stamps)
         assert [message.data for message in relay.repeat(3)(m.number_message(1.0), 0.0)] == [1.0] * 3
@@ -67,7 +68,7 @@ class TestTransforms:
 
     def test_stamps_shift(self) -> None:
         (shifted,) = relay.restamp(-1.0)(speed(3 * 10**9, 7.0), 0.0)
-        assert m.read_vehicle_speed(shifted).stamp_ns == 2 * 10**9
+        assert readings.vehicle_speed(shifted).stamp_ns == 2 * 10**9
         (clock,) = relay.restamp(5.0)(m.clock_message(10**9), 0.0)
         assert m.stamp_to_ns(clock.clock) == 6 * 10**9
 
@@ -85,7 +86,7 @@ class TestTransforms:
 
     def test_wheels_are_shuffled_with_their_values_or_left_out(self) -> None:
         (shuffled,) = relay.wheels((2, 0, 3, 1))(WHEELS, 0.0)
-        assert m.select_by_name(m.read_wheel_speeds(shuffled), m.WHEEL_NAMES) == (1.0, 2.0, 3.0, 4.0)
+        assert m.select_by_name(readings.wheel_speeds(shuffled), m.WHEEL_NAMES) == (1.0, 2.0, 3.0, 4.0)
         assert shuffled.name[0] == "rear_left"
         (three,) = relay.wheels((0, 1, 2))(WHEELS, 0.0)
         assert list(three.velocity) == [1.0, 2.0, 3.0]

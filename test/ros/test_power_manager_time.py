@@ -20,6 +20,7 @@ from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros import messages
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
+from oracles import readings
 
 PERIOD_NS = 20_000_000
 
@@ -125,9 +126,7 @@ class TestLockstep:
             monitor.take_speed(SpeedReading(stamp, speed), stamp)
             monitor.take_wheels(JointReading(stamp, messages.WHEEL_NAMES, wheels), stamp)
             sent = messages.battery_state_message(stamp, soc=soc, voltage_v=1.0, discharge_current_a=0.0)
-            monitor.take_battery(
-                BatteryReading(stamp, messages.read_battery_state(single(sent)).soc, 25.0, 0.0, 0.0), stamp
-            )
+            monitor.take_battery(BatteryReading(stamp, readings.battery_state(single(sent)).soc, 25.0, 0.0, 0.0), stamp)
             monitor.take_demand(demand, 0.0, stamp)
             command, numbers = twin.step(stamp, 0.02)
             assert tuple(torque.effort) == command.motor_torque_nm

@@ -28,14 +28,15 @@ from iwm_sim import simulator
 from iwm_sim.drive import Drive, RoadRow, load_run
 from iwm_sim.scenario import on_cycle
 from iwm_sim.simulator import PARAMETERS
+from oracles import readings
 
 MODULE = "iwm_sim.simulator"
 DOMAIN = int(os.environ["ROS_DOMAIN_ID"])
 NAMES = m.WHEEL_NAMES
 STAMPED = {
-    m.VEHICLE_SPEED: lambda message: m.read_vehicle_speed(message).stamp_ns,
-    m.WHEEL_STATES: lambda message: m.read_wheel_speeds(message).stamp_ns,
-    m.BATTERY_STATE: lambda message: m.read_battery_state(message).stamp_ns,
+    m.VEHICLE_SPEED: readings.stamp_ns,
+    m.WHEEL_STATES: readings.stamp_ns,
+    m.BATTERY_STATE: readings.stamp_ns,
 }
 
 
@@ -92,7 +93,7 @@ class StandIn:
                 self.unanswered.append(message.data)
             # Topics are not ordered among each other: the first demand may come before the first speed.
             while self.unanswered and self.received[m.VEHICLE_SPEED]:
-                speed = m.read_vehicle_speed(self.received[m.VEHICLE_SPEED][-1])
+                speed = readings.vehicle_speed(self.received[m.VEHICLE_SPEED][-1])
                 self.answer(speed.stamp_ns, speed.speed_mps, self.unanswered.pop(0))
 
         return keep
@@ -167,14 +168,14 @@ def test_each_step_of_a_lockstep_drive_is_one_set_with_one_stamp(stand_in) -> No
 def test_topics_show_the_car_as_it_is(stand_in) -> None:
     pair = stand_in(rate_hz=50.0)
     run, _ = pair.run()
-    speeds = [m.read_vehicle_speed(message).speed_mps for message in pair.received[m.VEHICLE_SPEED]]
+    speeds = [readings.vehicle_speed(message).speed_mps for message in pair.received[m.VEHICLE_SPEED]]
     np.testing.assert_array_equal(speeds, run["speed_mps"])
-    wheels = [m.read_wheel_speeds(message).values for message in pair.received[m.WHEEL_STATES]]
+    wheels = [readings.wheel_speeds(message).values for message in pair.received[m.WHEEL_STATES]]
     np.testing.assert_array_equal(np.array(wheels)[:, 0], run["front_wheel_radps"])
     # What the motors did in a step is shown at the next one.
     efforts = np.array([message.effort for message in pair.received[m.WHEEL_STATES]])
     np.testing.assert_array_equal(efforts[1:, 2], run["rear_motor_nm"][:-1])
-    batteries = [m.read_battery_state(message) for message in pair.received[m.BATTERY_STATE]]
+    batteries = [readings.battery_state(message) for message in pair.received[m.BATTERY_STATE]]
     np.testing.assert_array_equal([battery.soc for battery in batteries], run["soc"].astype(np.float32))
     assert batteries[200].discharge_current_a > 5.0
     assert batteries[200].voltage_v == pytest.approx(240.0, abs=15.0)

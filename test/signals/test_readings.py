@@ -40,6 +40,7 @@ from iwm_power_manager.signals.readings import (
 )
 from iwm_power_manager.signals.types import types_of
 from iwm_power_manager.vehicle import load_vehicle
+from oracles import readings as oracle
 
 numbers = st.floats(width=64)
 singles = st.floats(width=32)
@@ -111,11 +112,11 @@ def floats(draw) -> Float64:
 
 #: Topic, its readings by way of rclpy's message, and any such message.
 KINDS = {
-    "vehicle_speed": (lambda m, _: (messages.read_vehicle_speed(m),), speeds()),
-    "wheel_states": (lambda m, _: (messages.read_wheel_speeds(m), TorqueReading(*messages.read_torques(m))), wheels()),
-    "battery_state": (lambda m, _: (messages.read_battery_state(m),), batteries()),
-    "power_demand": (lambda m, sent_ns: (DemandReading(sent_ns, messages.read_number(m)),), floats()),
-    "road_friction": (lambda m, sent_ns: (FrictionReading(sent_ns, messages.read_number(m)),), floats()),
+    "vehicle_speed": (lambda m, _: (oracle.vehicle_speed(m),), speeds()),
+    "wheel_states": (lambda m, _: (oracle.wheel_speeds(m), TorqueReading(*messages.read_torques(m))), wheels()),
+    "battery_state": (lambda m, _: (oracle.battery_state(m),), batteries()),
+    "power_demand": (lambda m, sent_ns: (DemandReading(sent_ns, m.data),), floats()),
+    "road_friction": (lambda m, sent_ns: (FrictionReading(sent_ns, m.data),), floats()),
 }
 EXAMPLES = {
     "vehicle_speed": lambda i: messages.vehicle_speed_message(i, 2.0 * i),
