@@ -7,7 +7,7 @@ any car, from a solar racer to a lorry, and nearer than the thousandfold of a wr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,20 +81,6 @@ _BATTERY = (
         "Wh or mAh in an Ah field?",
     ),
 )
-
-
-def top_speed_mps(chassis: Mapping[str, float], power_w: float) -> float:
-    """Speed at which this mechanical power meets the road load on the level, m/s, at most `MAX_TOP_SPEED_MPS`."""
-    drag = 0.5 * chassis["air_density_kgpm3"] * chassis["frontal_area_m2"] * chassis["drag_coefficient"]
-    rolling = chassis["rolling_resistance"] * chassis["mass_kg"] * _GRAVITY_MPS2
-    low, high = 0.0, MAX_TOP_SPEED_MPS
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if (drag * middle * middle + rolling) * middle < power_w:
-            low = middle
-        else:
-            high = middle
-    return high
 
 
 def check_car(path: Path, params: VehicleParams, key_of: Callable[[str, str], str]) -> None:

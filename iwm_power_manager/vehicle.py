@@ -30,6 +30,7 @@ from iwm_power_manager.model.parameters import (
     VehicleParams,
     Wheel,
 )
+from iwm_power_manager.model.top_speed import top_speed_mps
 from iwm_power_manager.motor_map import MotorMap, Reach, extended, filled, fit_loss, mirrored, missing, read_map
 from iwm_power_manager.vehicle_table import ORDERED, TABLE
 
@@ -182,7 +183,8 @@ def _axles(
     """Front and rear axle, and what there is to say about their motor maps."""
     given = {axle: _sections(path, content, axle) for axle in ("front", "rear")}
     motors = {axle: _numbers(path, "motor", *found.sections["motor"], _MOTOR_OPTIONS) for axle, found in given.items()}
-    top_speed_mps = plausibility.top_speed_mps(chassis, 2.0 * sum(motor["max_power_w"] for motor in motors.values()))
+    power_w = 2.0 * sum(motor["max_power_w"] for motor in motors.values())
+    reach_mps = top_speed_mps(Chassis(**chassis), power_w, plausibility.MAX_TOP_SPEED_MPS)
     axles: list[Axle] = []
     notes: list[str] = []
     for axle, found in given.items():
@@ -191,7 +193,7 @@ def _axles(
             break
         wheel = Wheel(**_numbers(path, "wheel", *found.sections["wheel"]))
         gear = _numbers(path, "gear", *found.sections["gear"], (), chassis) if "gear" in found.sections else None
-        shaft_radps = top_speed_mps / wheel.radius_m * (gear["ratio"] if gear else 1.0)
+        shaft_radps = reach_mps / wheel.radius_m * (gear["ratio"] if gear else 1.0)
         motor, note = _motor(path, *found.sections["motor"], motors[axle], drive, shaft_radps, content["format"])
         if gear:
             motor, wheel = behind_gear(motor, wheel, **gear)

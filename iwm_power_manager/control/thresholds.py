@@ -18,9 +18,11 @@ from iwm_power_manager.control.settings import Change, Setting
 from iwm_power_manager.control.supervision import SupervisionLimits
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.pedals import PEDAL_TRAVEL, demand_power_w
+from iwm_power_manager.model.top_speed import motor_power_w, top_speed_mps
 
-#: More than this many times what the car's own pedals ask for is no demand.
-_BEYOND_PEDALS = 1.5
+#: More than this many times what the car's own pedals ask for is no demand; so many times its top speed no car does
+#: downhill, so many times rolling no wheel without grip, and so many times what its torques make of a wheel nothing.
+_BEYOND_PEDALS, _BEYOND_TOP_SPEED, _BEYOND_ROLLING, _BEYOND_TORQUE = 1.5, 1.2, 1.5, 2.0
 _INF = math.inf
 
 
@@ -36,15 +38,21 @@ class Thresholds:
     stamp_oldest_s: float = _threshold(0.1, "s", 0.001, 60.0, "a message stamped longer ago than this is dropped")
     # Clocks of two computers are never quite equal.
     stamp_future_s: float = _threshold(0.02, "s", 0.0, 60.0, "a message stamped further ahead than this is dropped")
-    speed_max_mps: float = _threshold(60.0, "m/s", 1.0, 150.0, "largest believed vehicle speed, either way")
+    speed_max_mps: float = _threshold(
+        60.0, "m/s", 1.0, 150.0, "largest believed vehicle speed; a fifth above the car's own top speed is, too"
+    )
     # No road car brakes or drives off at more than 1.5 g; a crash is none of our business.
     speed_rate_mps2: float = _threshold(25.0, "m/s2", 1.0, 1000.0, "largest believed change of vehicle speed")
     speed_noise_mps: float = _threshold(0.6, "m/s", 0.0, 5.0, "change of vehicle speed that is always believed")
     # A car that rolls back unbraked; faster it does not drive backwards.
     speed_min_mps: float = _threshold(-30.0, "m/s", -150.0, 0.0, "smallest believed vehicle speed")
-    wheel_speed_max_radps: float = _threshold(300.0, "rad/s", 1.0, 2000.0, "largest believed wheel speed, either way")
+    wheel_speed_max_radps: float = _threshold(
+        300.0, "rad/s", 1.0, 2000.0, "largest believed wheel speed, either way; half as much again as rolling is, too"
+    )
     # Full braking torque on a wheel without grip: 900 N m on 1.1 kg m2 is 820 rad/s2; twice that.
-    wheel_rate_radps2: float = _threshold(2000.0, "rad/s2", 1.0, 1e5, "largest believed change of a wheel speed")
+    wheel_rate_radps2: float = _threshold(
+        2000.0, "rad/s2", 1.0, 1e5, "largest believed change of a wheel speed; what its own torques can do is, too"
+    )
     wheel_noise_radps: float = _threshold(3.0, "rad/s", 0.0, 50.0, "change of a wheel speed that is always believed")
     wheel_opposite_radps: float = _threshold(
         3.0, "rad/s", 0.0, 50.0, "backward wheel speed that is believed while the car drives forwards"
@@ -131,7 +139,12 @@ class Thresholds:
     )
     # Ten periods of the control loop and the age at which inputs are missing: what was remembered is no longer true.
     own_gap_s: float = _threshold(
-        0.1, "s", 0.02, 60.0, "the node itself was held up for longer: it starts over as after activation"
+        0.1,
+        "s",
+        0.02,
+        60.0,
+        "the node itself was held up for longer, and for longer than longest_step_periods: it starts over as after "
+        "activation",
     )
     # At 20 m/s the car has moved a metre.
     command_oldest_s: float = _threshold(
@@ -186,16 +199,26 @@ def supervision_limits(thresholds: Thresholds) -> SupervisionLimits:
 
 
 def for_car(thresholds: Thresholds, vehicle: VehicleParams) -> Thresholds:
-    """Thresholds that believe what a car's own pedals ask for, at any speed that is believed.
+    """Thresholds that believe a car's own speeds, and what its own pedals ask for at any speed that is believed.
 
-    A heavy or strong car asks for more than the defaults: the brake pedal of 2.8 t at 0.8 g and 30 m/s for 660 kW.
+    A fast, heavy or strong car goes beyond the defaults: the brake pedal of 2.8 t at 0.8 g and 30 m/s asks for 660 kW.
     """
+    top_mps = top_speed_mps(vehicle.chassis, motor_power_w(vehicle))
+    speed_max_mps = max(thresholds.speed_max_mps, _BEYOND_TOP_SPEED * top_mps)
     accelerator, brake = (
-        _BEYOND_PEDALS * float(demand_power_w(PEDAL_TRAVEL, *travel, thresholds.speed_max_mps, vehicle))
+        _BEYOND_PEDALS * float(demand_power_w(PEDAL_TRAVEL, *travel, speed_max_mps, vehicle))
         for travel in ((1.0, 0.0), (0.0, 1.0))
+    )
+    axles = (vehicle.front, vehicle.rear)
+    turning_radps = _BEYOND_ROLLING * speed_max_mps / min(axle.wheel.radius_m for axle in axles)
+    jerked_radps2 = _BEYOND_TORQUE * max(
+        (axle.friction_brake.max_torque_nm + axle.motor.peak_torque_nm) / axle.wheel.inertia_kgm2 for axle in axles
     )
     return dataclasses.replace(
         thresholds,
+        speed_max_mps=speed_max_mps,
+        wheel_speed_max_radps=max(thresholds.wheel_speed_max_radps, turning_radps),
+        wheel_rate_radps2=max(thresholds.wheel_rate_radps2, jerked_radps2),
         demand_max_w=max(thresholds.demand_max_w, accelerator),
         demand_min_w=min(thresholds.demand_min_w, brake),
     )

@@ -31,7 +31,6 @@ from iwm_power_manager.files import (
     dotted,
     read_yaml,
 )
-from iwm_power_manager.model.chassis import road_load_n
 from iwm_power_manager.model.decision import (
     ERROR_NORMS,
     POWER_ERRORS,
@@ -40,6 +39,7 @@ from iwm_power_manager.model.decision import (
     ProblemParams,
 )
 from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.top_speed import motor_power_w, top_speed_mps
 
 FORMAT = 1
 
@@ -121,7 +121,7 @@ class Problem:
         if self.power_of_car.size:
             power = np.round(self.power_of_car * motor_power_w(vehicle), 1) + 0.0
         if self.speed_of_car.size:
-            points = np.round(self.speed_of_car * top_speed_mps(vehicle), 2)
+            points = np.round(self.speed_of_car * top_speed_mps(vehicle.chassis, motor_power_w(vehicle)), 2)
             # Points of both kinds must not crowd where they meet.
             speed = np.concatenate([speed, points[points > 1.1 * speed[-1]]])
         none = np.zeros(0)
@@ -185,24 +185,6 @@ class Problem:
 def price_matrix(share: NDArray[np.float64]) -> NDArray[np.float64]:
     """float64[U, U]: what a change from a share (rows) to another (columns) costs, in prices of a change."""
     return np.array([[price_units(after - before) for after in share] for before in share])
-
-
-def motor_power_w(vehicle: VehicleParams) -> float:
-    """Power of all motors, W: the unit of a relative power axis."""
-    return 2.0 * (vehicle.front.motor.max_power_w + vehicle.rear.motor.max_power_w)
-
-
-def top_speed_mps(vehicle: VehicleParams) -> float:
-    """Speed at which the road load takes all motors' power, m/s: the unit of a relative speed axis; 100 at most."""
-    power = motor_power_w(vehicle)
-    low, high = 1.0, 100.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if road_load_n(middle, 0.0, vehicle.chassis) * middle < power:
-            low = middle
-        else:
-            high = middle
-    return low
 
 
 _AXES = {  # axis: (low, high, unit)

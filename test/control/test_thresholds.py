@@ -9,6 +9,7 @@ import math
 import pytest
 
 from iwm_power_manager.control import settings, thresholds
+from iwm_power_manager.control.inputs import Violation, check_value
 from iwm_power_manager.control.settings import Change
 from iwm_power_manager.control.thresholds import RECORDED, Thresholds, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.model.pedals import PEDAL_TRAVEL, demand_power_w
@@ -120,6 +121,27 @@ def test_what_a_car_s_own_pedals_ask_for_is_believed_at_any_speed_that_is(name, 
         assert demand_power_w(PEDAL_TRAVEL, 0.0, 1.0, speed, params) >= found.demand.minimum
 
 
-def test_a_threshold_that_is_wider_than_the_car_s_pedals_stays_as_it_is():
-    wide = Thresholds(demand_max_w=5e6, demand_min_w=-2e7)
+def test_a_threshold_that_is_wider_than_the_car_s_pedals_and_speeds_stays_as_it_is():
+    wide = Thresholds(
+        demand_max_w=5e6, demand_min_w=-2e7, speed_max_mps=150.0, wheel_speed_max_radps=2000.0, wheel_rate_radps2=1e5
+    )
     assert thresholds.for_car(wide, load_vehicle(resolve("compact_two_motors")).params) == wide
+
+
+def test_what_a_fast_car_and_its_wheels_do_is_believed():
+    """350 km/h; on the level its motors reach them, and its brakes stop a wheel without grip within 50 ms."""
+    car = load_vehicle(resolve("compact_two_motors")).params
+    chassis = car.chassis._replace(drag_coefficient=0.9 * car.chassis.drag_coefficient)
+    found = input_limits(thresholds.for_car(Thresholds(), car._replace(chassis=chassis)), 0.33, by_clock=True)
+    fast = 350.0 / 3.6
+    assert check_value(fast, fast - 0.1, 0.01, found.speed) is Violation.NONE
+    for axle in (car.front, car.rear):
+        rolling = fast / axle.wheel.radius_m
+        torque = axle.friction_brake.max_torque_nm + axle.motor.peak_torque_nm
+        locking = rolling - torque / axle.wheel.inertia_kgm2 * 0.01
+        assert check_value(1.3 * rolling, 1.3 * rolling, 0.01, found.wheels.value) is Violation.NONE
+        assert check_value(locking, rolling, 0.01, found.wheels.value) is Violation.NONE
+
+
+def test_the_paper_s_car_is_judged_as_the_table_says():
+    assert thresholds.for_car(Thresholds(), load_vehicle(resolve("jalalmaab_2015")).params) == Thresholds()
