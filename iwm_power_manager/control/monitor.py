@@ -221,9 +221,14 @@ class InputMonitor:
         return self.tallies[SPEED].accepted_ns is not None and self.tallies[DEMAND].accepted_ns is not None
 
     @property
+    def shown_mps(self) -> list[float]:
+        """What `vehicle_speed` and the wheels show."""
+        return [self.speed_mps, *(speed * self._limits.radius_m for speed in self.wheel_speed_radps)]
+
+    @property
     def agree(self) -> bool:
         """`vehicle_speed` and all wheels show the same motion."""
-        shown = [self.speed_mps, *(speed * self._limits.radius_m for speed in self.wheel_speed_radps)]
+        shown = self.shown_mps
         return max(shown) - min(shown) <= _SAME_MPS + _SAME * max(map(abs, shown))
 
     def take_speed(self, reading: SpeedReading, now_ns: int) -> bool:

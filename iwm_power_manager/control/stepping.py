@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from iwm_power_manager.control.car_restart import CarRestart
 from iwm_power_manager.control.controller import ControlFaultError, Controller, Step
 from iwm_power_manager.control.lockstep import LockstepQueue, LockstepSet
 from iwm_power_manager.control.thresholds import Thresholds
@@ -17,6 +18,9 @@ _NS_PER_S = 1e9
 #: Of the age a command may have: the rest is the middleware's, which may have to wait for a lock that a thread without
 #: a processor holds (12 ms and more were seen where five processes wanted each processor).
 OWN_SHARE = 0.5
+#: Why a run in real time begins anew by itself.
+HELD_UP = "this process was held up (own_gap_s)"
+CAR_STARTED_OVER = "vehicle_speed and wheels stayed away, and stand now: the car was started over"
 
 
 class Taken(NamedTuple):
@@ -44,6 +48,7 @@ class Stepper:
     controller : takes the steps
     last_ns : time of the step before; None at the start of a run
     restarts : how often a run began anew by itself
+    reason : why it did the last time, in real time
     """
 
     def __init__(self, controller: Controller, period_s: float) -> None:
@@ -51,6 +56,7 @@ class Stepper:
         self.period_s = period_s
         self.last_ns: int | None = None
         self.restarts = 0
+        self.reason = ""
 
     def start_over(self) -> None:
         """Begin a new run, as at activation."""
@@ -61,8 +67,9 @@ class Stepper:
         """Time since the step before; None at the first of a run."""
         return None if self.last_ns is None else (now_ns - self.last_ns) / _NS_PER_S
 
-    def _restart(self) -> None:
+    def _restart(self, reason: str = "") -> None:
         self.restarts += 1
+        self.reason = reason
         self.start_over()
 
     def _take(self, stamp_ns: int, dt_s: float, since_s: float | None) -> Taken:
@@ -83,22 +90,28 @@ class RealTime(Stepper):
     def __init__(self, controller: Controller, period_s: float, thresholds: Thresholds) -> None:
         super().__init__(controller, period_s)
         self._thresholds = thresholds
+        self._gap_s = max(thresholds.own_gap_s, thresholds.longest_step_periods * period_s)  # of a slow loop, steps
         self._began_s: float | None = None
+        self._car_restart = CarRestart()
 
     def start_over(self) -> None:
         """Begin a new run, as at activation."""
         super().start_over()
         self._began_s = None
+        self._car_restart = CarRestart()
 
     def begin(self, steady_s: float | None) -> None:
-        """Before inputs are looked at: start over, as after activation, if this process was held up for too long.
+        """Before inputs are looked at: start over, as after activation, if this process was held up for too long, or
+        the car was started over.
 
         Parameters
         ----------
         steady_s : monotonic clock; None where time is simulated and may well stand still
         """
-        if steady_s is not None and self._began_s is not None and steady_s - self._began_s > self._thresholds.own_gap_s:
-            self._restart()
+        if steady_s is not None and self._began_s is not None and steady_s - self._began_s > self._gap_s:
+            self._restart(HELD_UP)
+        elif self._car_restart.found:
+            self._restart(CAR_STARTED_OVER)
         self._began_s = steady_s
 
     def step(self, now_ns: int) -> Taken:
@@ -111,13 +124,15 @@ class RealTime(Stepper):
         shortest_s = self._thresholds.shortest_step_periods * self.period_s
         longest_s = self._thresholds.longest_step_periods * self.period_s
         dt_s = self.period_s if since_s is None else min(max(since_s, shortest_s), longest_s)
-        return self._take(now_ns, dt_s, since_s)
+        taken = self._take(now_ns, dt_s, since_s)
+        self._car_restart.look(self.controller, now_ns)
+        return taken
 
     def may_send(self, steady_s: float) -> bool:
         """Just before sending: whether the command is young enough; the run starts over if it is older than allowed."""
         age_s = 0.0 if self._began_s is None else steady_s - self._began_s
         if age_s > self._thresholds.command_oldest_s:
-            self._restart()
+            self._restart(HELD_UP)
         return age_s <= OWN_SHARE * self._thresholds.command_oldest_s
 
 

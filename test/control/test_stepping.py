@@ -8,6 +8,7 @@ import pytest
 from iwm_power_manager.control.controller import ControlFaultError, Step
 from iwm_power_manager.control.lockstep import BATTERY, SPEED, WHEELS
 from iwm_power_manager.control.stepping import AsRecorded, Lockstep, RealTime
+from iwm_power_manager.control.supervision import Supervision
 from iwm_power_manager.control.thresholds import Thresholds
 
 MS = 1_000_000
@@ -19,6 +20,9 @@ class Monitor:
         self._log = log
         self.driven = True
         self.believes = True
+
+    def ages_s(self, now_ns):
+        return (0.0, 0.0, 0.0, 0.0)
 
     def forget_times(self):
         self._log.append("forget times")
@@ -42,6 +46,9 @@ class Controller:
         self.log = []
         self.monitor = Monitor(self.log)
         self.fault = ""
+        self.command = None
+        self.wheels_lost = 0
+        self.supervision = Supervision()
 
     def reset(self):
         self.log.append("reset")
@@ -89,6 +96,14 @@ class TestRealTime:
             stepper.step(int(at_s * 1e9))
             assert controller.log.count("reset") == stepper.restarts == resets
         assert [step[2] is None for step in controller.steps()] == [True, False, True, False]
+
+    def test_a_slow_loop_is_not_held_up_by_its_own_period(self, controller):
+        stepper = RealTime(controller, 0.1, Thresholds())
+        for i in range(5):
+            stepper.begin(5.0 + 0.13 * i)
+        assert stepper.restarts == 0
+        stepper.begin(9.0)
+        assert stepper.restarts == 1
 
     def test_on_simulated_time_the_process_s_own_clock_says_nothing(self, stepper, controller):
         for at_s in (None, None, 7.0, None, 99.0):
