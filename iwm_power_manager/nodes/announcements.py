@@ -50,6 +50,7 @@ class Announcements:
         self._said: dict[str, float] = {}
         self._problems: set[str] = set()
         self._found_s: dict[str, float] = {}
+        self._odd_pedals: set[str] = set()
         self._values: Mapping[str, Any] = {}
         self._heard_ns: Mapping[str, int] = {}
         self.activated()
@@ -91,12 +92,19 @@ class Announcements:
         inputs = "; ".join(f"{name} from {', '.join(found)}" for name, found in topics.items())
         self._logger.info(f"configured, {rate}: {inputs}; commands to {', '.join(commands)}")
 
-    def held_up(self) -> None:
-        """Tell that the process itself was late."""
+    def started_over(self, reason: str) -> None:
+        """Tell why a run began anew by itself."""
         self._mode = MODE_WAITING
         self._said["waiting"] = time.monotonic() - REPEAT_S + 1.0
-        if self._due("held up"):
-            self._logger.warning("this process was held up: it starts over, as after activation (own_gap_s)")
+        if self._due(reason):
+            self._logger.warning(f"{reason}: it starts over, as after activation")
+
+    def pedals(self, remarks: Mapping[str, tuple[bool, str]]) -> None:
+        """Tell once what is odd about each pedal, and warn of what is sure (`Assembly.remarks`)."""
+        for pedal in remarks.keys() - self._odd_pedals:
+            sure, text = remarks[pedal]
+            (self._logger.warning if sure else self._logger.info)(text)
+        self._odd_pedals |= remarks.keys()
 
     def problems(self, found: list[str]) -> None:
         """Tell what is wrong with other endpoints, each line once it has stood for a moment, and that it is over."""

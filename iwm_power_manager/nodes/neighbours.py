@@ -54,7 +54,11 @@ def look(node: Node, inputs: Inputs, outputs: Outputs, slow: dict[str, str]) -> 
 
 
 def _lines(reasons: dict[str, str]) -> list[str]:
-    return [f"{topic}: {why}" for topic, why in reasons.items()]
+    """A line for all topics that have the same reason."""
+    topics: dict[str, list[str]] = {}
+    for topic, why in reasons.items():
+        topics.setdefault(why, []).append(topic)
+    return [f"{', '.join(found)}: {why}" for why, found in topics.items()]
 
 
 def _shared(publishers: dict[str, int]) -> list[str]:

@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import pairwise
 from math import inf
+from statistics import median
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -37,17 +38,20 @@ _QUEUES: dict[type, int] = {SpeedReading: SPEED, JointReading: WHEELS, BatteryRe
 _NS_PER_S = 1_000_000_000
 #: A rate is that of so many messages at most, and of so many at least.
 _MOST_SENT, _FEWEST_SENT = 32, 5
-#: Slower than this part of the rate that was said is another rate.
-_SLOW = 0.6
+#: Slower than this part of the rate that was said is another rate, until it is faster than the second part of it.
+_SLOW, _SLOW_NO_MORE = 0.6, 0.8
 #: After so many periods without a message a topic is silent, and not slow.
 _SILENT = 4.0
 
 
 def rate_hz(sent_ns: Collection[int]) -> float:
-    """Rate of messages sent at these times, the longest pause left out; infinite for too few to tell."""
+    """Rate of messages sent at these times, by the middle one of their gaps: some may be missing, or have come late.
+
+    Infinite for too few to tell, and for bursts.
+    """
     gaps_ns = [later - sooner for sooner, later in pairwise(sent_ns)]
-    together_ns = sum(gaps_ns) - max(gaps_ns, default=0)
-    return (len(gaps_ns) - 1) * _NS_PER_S / together_ns if len(sent_ns) >= _FEWEST_SENT and together_ns > 0 else inf
+    gap_ns = median(gaps_ns) if len(sent_ns) >= _FEWEST_SENT else 0
+    return _NS_PER_S / gap_ns if gap_ns > 0 else inf
 
 
 class Inputs:
@@ -79,7 +83,10 @@ class Inputs:
         self.types = {self._full[topic]: reader.read.types.name for topic, reader in readers.items()}
         self.heard_ns: dict[str, int] = {}
         self._sent_ns = {topic: deque[int](maxlen=_MOST_SENT) for topic in self.types}
-        self._slow: dict[str, str] = {}
+        self._slow: dict[str, dict[str, str]] = {}
+        self._of_one_wheel = {
+            topic for topic, reader in readers.items() if any(source.of_one_wheel for source in reader.sources)
+        }
         for topic, reader in readers.items():
             kind = messages.message_class(reader.read.types.name)
             asked = _asked(reader, lockstep=on_demand is not None)
@@ -105,6 +112,9 @@ class Inputs:
     def drop_all(self) -> None:
         """Forget what has arrived."""
         self._intake.drop_all()
+
+    def forget_rates(self) -> None:
+        """Measure them anew: this node was not there all the time."""
         for sent_ns in self._sent_ns.values():
             sent_ns.clear()
 
@@ -112,10 +122,13 @@ class Inputs:
         """Real time: judge what has arrived on every topic."""
         ahead_ns = now_ns - time.time_ns()  # of DDS, which tells when an unstamped message was sent
         for topic, reader in self._readers.items():
-            for data, info in self._intake.take(topic):
-                sent_ns = info["source_timestamp"] + ahead_ns
-                self.heard_ns[self._full[topic]] = now_ns
-                self._sent_ns[self._full[topic]].append(sent_ns)
+            taken = [(data, info["source_timestamp"] + ahead_ns) for data, info in self._intake.take(topic)]
+            if not taken:
+                continue
+            self.heard_ns[self._full[topic]] = now_ns
+            self._sent_ns[self._full[topic]].extend(sent_ns for _, sent_ns in taken)
+            # Four wheels on four topics are put together: a second of one would come before the first of the next.
+            for data, sent_ns in taken[-1:] if topic in self._of_one_wheel else taken:
                 for reading in reader(data, sent_ns):
                     judge(monitor, reading, now_ns)
 
@@ -141,8 +154,8 @@ class Inputs:
                         judge(monitor, reading, now_ns)
 
     def slow(self, topics: Mapping[str, Sequence[str]], values: Mapping[str, Any], now_ns: int) -> dict[str, str]:
-        """Topics that come far more slowly than their period says, by full name, each with the rate; the same words
-        as long as it lasts.
+        """Topics that come far more slowly than their period says, by full name, with the rate of an input's slowest;
+        the same topics and words as long as it lasts.
 
         Parameters
         ----------
@@ -151,16 +164,18 @@ class Inputs:
         now_ns : the node's clock
         """
         found = {}
-        for name in topics:
+        for name, of_input in topics.items():
             period_s = values.get(f"input_period_s.{name}", inf)  # friction may come when it likes
-            for topic in topics[name]:
-                hz = rate_hz(self._sent_ns[topic])
-                lasts = hz * (now_ns - self.heard_ns.get(topic, 0)) < _SILENT * _NS_PER_S
-                if hz * period_s < _SLOW and lasts:
-                    words = f"comes at {hz:.3g} Hz, not at {1.0 / period_s:.3g}: input_period_s.{name} is {period_s:g}"
-                    found[topic] = self._slow.get(topic, words)
+            enough_hz = (_SLOW_NO_MORE if name in self._slow else _SLOW) / period_s
+            silent_ns = {topic: now_ns - self.heard_ns.get(topic, 0) for topic in of_input}
+            rates = {topic: rate_hz(self._sent_ns[topic]) for topic in of_input}
+            slow = [t for t, hz in rates.items() if hz < enough_hz and hz * silent_ns[t] < _SILENT * _NS_PER_S]
+            if slow:
+                hz = min(rates[topic] for topic in slow)
+                words = f"comes at {hz:.3g} Hz, not at {1.0 / period_s:.3g}: input_period_s.{name} is {period_s:g}"
+                found[name] = self._slow.get(name) or dict.fromkeys(slow, words)
         self._slow = found
-        return found
+        return {topic: words for of_input in found.values() for topic, words in of_input.items()}
 
     def how_to_hear(self, topic: str, msgtype: str) -> str:
         """What to write in the signals file to take a topic (full name) with another type; "" if that is not clear."""
@@ -185,9 +200,7 @@ def _asked(reader: TopicReader, *, lockstep: bool) -> QoSProfile:
     if lockstep:
         return qos.profile(lockstep=True)
     reliable = any(source.qos == "reliable" for source in reader.sources)
-    # Four wheels on four topics are put together: more than the newest of one would come before the first of the next.
-    depth = 1 if any(source.of_one_wheel for source in reader.sources) else qos.INPUT_DEPTH
-    return qos.profile(lockstep=False, depth=depth, reliability="reliable" if reliable else "best_effort")
+    return qos.profile(lockstep=False, depth=qos.INPUT_DEPTH, reliability="reliable" if reliable else "best_effort")
 
 
 def judge(monitor: InputMonitor, reading: Any, now_ns: int) -> None:

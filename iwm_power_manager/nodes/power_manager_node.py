@@ -10,6 +10,7 @@ docs/safety.md for the reasons.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
 from iwm_power_manager.control.controller import Controller
-from iwm_power_manager.control.stepping import Lockstep, RealTime, Taken
+from iwm_power_manager.control.stepping import HELD_UP, Lockstep, RealTime, Taken
 from iwm_power_manager.errors import IwmError, one_line
 from iwm_power_manager.nodes import neighbours, pace
 from iwm_power_manager.nodes import power_manager_config as config
@@ -85,6 +86,7 @@ class PowerManager(Starting):
         self._last_step_steady_s = 0.0
         self._answer: list[tuple[str, bytes]] | None = None
         self._topics: dict[str, tuple[str, ...]] = {}
+        self._remarks: Callable[[], dict[str, tuple[bool, str]]] = dict
         self._unheard: dict[str, str] = {}
         self._says = Announcements(self.get_logger())
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -187,7 +189,7 @@ class PowerManager(Starting):
         values = self._values
         self._wheel_names = tuple(values["wheel_names"])
         self._period_s = 1.0 / values["rate_hz"]
-        self._controller, self._policies = prepared.controller, prepared.policies
+        self._controller, self._policies, self._remarks = prepared.controller, prepared.policies, prepared.remarks
         self._topics = {
             name: tuple(map(self.resolve_topic_name, topics)) for name, topics in input_topics(prepared.mapping).items()
         }
@@ -244,6 +246,8 @@ class PowerManager(Starting):
         if self._demand_log:
             self._demand_log.pause()
         self._answer = None
+        if self._inputs is not None:
+            self._inputs.forget_rates()
 
     # Lock-step
 
@@ -306,7 +310,7 @@ class PowerManager(Starting):
             return
         if self._stepper.restarts != self._restarts:
             if isinstance(self._stepper, RealTime):
-                self._says.held_up()
+                self._says.started_over(self._stepper.reason)
             self._began_anew()
         if taken.step is None:
             if self._answer is not None:
@@ -396,7 +400,7 @@ class PowerManager(Starting):
             if stepping and standing_s > self._values["clock_stopped_s"]:
                 stepping = False
                 if not self.get_clock().ros_time_is_active:
-                    self._says.held_up()
+                    self._says.started_over(HELD_UP)
                     self._fault = "no control step: this process was held up, or the system's clock was set back"
                 elif self._fault != _STANDS_STILL:
                     self._fault = _STANDS_STILL
@@ -406,6 +410,7 @@ class PowerManager(Starting):
                 self._outputs.zero(self._now_ns())
             elif self._fault and self._stepper is not None and self._stepper.last_ns is not None:
                 self._fault = ""
+            self._says.pedals(self._remarks())
             heard_ns = self._inputs.heard_ns if self._inputs else {}
             self._says.stepped(controller, self._topics, self._unheard, self._wheel_names, self._now_ns(), heard_ns)
         shown = controller and (

@@ -42,6 +42,7 @@ class Prepared(NamedTuple):
     mapping : the signals file
     readers : by topic
     commands : writer of each command
+    remarks : what is odd about the pedals (`Assembly.remarks`)
     elapsed_s : time it took
     compiled : kernels that the cache did not hold
     """
@@ -53,6 +54,7 @@ class Prepared(NamedTuple):
     mapping: SignalMapping
     readers: dict[str, TopicReader]
     commands: dict[str, CommandWriter]
+    remarks: Callable[[], dict[str, tuple[bool, str]]]
     elapsed_s: float
     compiled: int
 
@@ -85,7 +87,7 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
     friction = settings.friction_prior if estimated else values["friction"]
     table = policies.table(friction)
     controller = Controller(mapping.car(vehicle.params), names, limits, settings, table, friction)
-    readers, commands = _interface(mapping, controller, vehicle, values, limits.inputs.demand)
+    readers, commands, assembly = _interface(mapping, controller, vehicle, values, limits.inputs.demand)
     # The first call compiles the law or reads it from the cache: seconds that no control step may take.
     for warmed in policies.tables():
         controller.policy = warmed
@@ -97,12 +99,14 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
 
     compiled = sum(not use.found for use in USES)
     elapsed_s = time.monotonic() - started_s
-    return Prepared(values, vehicle, policies, controller, mapping, readers, commands, elapsed_s, compiled)
+    return Prepared(
+        values, vehicle, policies, controller, mapping, readers, commands, assembly.remarks, elapsed_s, compiled
+    )
 
 
 def _interface(
     mapping: SignalMapping, controller: Controller, vehicle: Vehicle, values: Mapping[str, Any], demand: ValueLimits
-) -> tuple[dict[str, TopicReader], dict[str, CommandWriter]]:
+) -> tuple[dict[str, TopicReader], dict[str, CommandWriter], Assembly]:
     demands = {source.topic for signal in (*DEMANDS, *PEDALS) for source in mapping.sources.get(signal, ())}
     if values["lockstep"] and len(demands) > 1:
         problem = "the demand closes a set of inputs in lock-step, and comes on two topics"
@@ -120,7 +124,7 @@ def _interface(
     assembly.warm(mapping.sources)
     limits = f"demand_min_w {demand.minimum:g} to demand_max_w {demand.maximum:g}"
     monitor.tallies[DEMAND].describe = lambda: f"{assembly.wanted_in_words()}; allowed: {limits}"
-    return readers, commands
+    return readers, commands, assembly
 
 
 def _check_installed(file: Path, key: str, msgtype: str) -> None:

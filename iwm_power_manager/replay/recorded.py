@@ -297,7 +297,8 @@ def check_signals(reader: BagReader, mapping: SignalMapping, stream: SignalStrea
     if wheels and "wheel_speed" not in stream.signals:
         lacking.append("wheel_speed")
     if lacking:
-        raise BagError(f"{reader.path}: holds no topic that {mapping.path} maps to {lacking[0]}; it holds {held}")
+        problem = f"holds no topic that {mapping.path} maps to {lacking[0]}; it holds {held}"
+        raise BagError(f"{reader.path}: {problem}; other topics are named by a signals file: --mapping")
 
 
 def _advancing(time_ns: NDArray[np.int64]) -> NDArray[np.intp]:

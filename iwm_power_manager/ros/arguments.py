@@ -17,6 +17,8 @@ from iwm_power_manager.ros.specs import ParameterError, Spec
 EXIT_CODES = "exit codes: 0 ended as asked, 1 failed, 2 bad arguments, parameters or files"
 
 _PARAMS_FILE = "--params-file"
+#: What stands after ROS's options that set something.
+_SETTING = dict.fromkeys(("-p", "--param"), "PARAMETER:=VALUE") | dict.fromkeys(("-r", "--remap"), "FROM:=TO")
 
 
 def check_parameter_files(arguments: Sequence[str], node: str = "") -> None:
@@ -88,6 +90,7 @@ def check_arguments(
     )
     if "--ros-args" not in given and set(given).intersection(("-h", "--help")):
         parser.parse_args(given[1:])
+    _check_settings(given)
     from rclpy.utilities import remove_ros_args  # which takes its time to be imported
 
     try:
@@ -96,6 +99,16 @@ def check_arguments(
         # rcl adds where in its sources that was noticed.
         raise ParameterError(" ".join(str(error).split(", at ")[0].split())) from None
     parser.parse_args(own)
+
+
+def _check_settings(given: Sequence[str]) -> None:
+    """What rcl refuses in terms of its parser: settings without `:=`, and texts whose quotes the shell has taken."""
+    of_ros = given[given.index("--ros-args") :] if "--ros-args" in given else []
+    for option, text in itertools.pairwise(of_ros):
+        name, sign, value = text.partition(":=")
+        if option in _SETTING and not (name and value):
+            quotes = f"; an empty text is \"{name}:=''\": the shell takes quotes away" if name and sign else ""
+            raise ParameterError(f"{option} {text!r} is not allowed; allowed: {_SETTING[option]}{quotes}")
 
 
 def _shown(value: object) -> str:

@@ -29,6 +29,7 @@ from iwm_power_manager.signals.cdr import (
     numbers_in,
 )
 from iwm_power_manager.signals.contract import JOINT_STATE
+from iwm_power_manager.signals.gentle_pedal import GentlePedal
 from iwm_power_manager.signals.mapping import (
     BATTERY,
     DEMANDS,
@@ -163,6 +164,7 @@ class Assembly:
         self._speed_mps = speed_mps or (lambda: self.speed_read_mps)
         self._wanted = "power_demand", _NAN, _NAN
         self._pedals = dict.fromkeys(PEDALS, (_UNMAPPED_NS, 0.0))
+        self._use = {pedal: GentlePedal() for pedal in PEDALS}
         self._wheels = {signal: [_NAN] * WHEELS for signal in _JOINTS}
         self._came = {signal: [0] * WHEELS for signal in _JOINTS}
 
@@ -186,6 +188,7 @@ class Assembly:
         """The demand of both pedals: as old as the older one, or as the brake if that is pressed."""
         assert self.vehicle is not None  # checked when the readers were made
         self._pedals[signal] = time_ns, value
+        self._use[signal].note(time_ns, value)
         (_, accelerator), (brake_ns, brake) = (self._pedals[pedal] for pedal in PEDALS)
         travel = 1.0 if brake > _TRAVEL[1] else _way(brake)  # a brake demand gets through whatever its unit
         times_ns = [told for told, _ in self._pedals.values() if told != _UNMAPPED_NS]
@@ -218,6 +221,11 @@ class Assembly:
         if signal in PEDALS and math.isinf(_way(value)):
             way = f"; a pedal's way is 0 to {1.0 / unit.factor:g}{symbol}: right unit?"
         return f"{signal} {value / unit.factor:g}{symbol}{where}{power}{way}"
+
+    def remarks(self) -> dict[str, tuple[bool, str]]:
+        """What is odd about pedals, by signal, and whether it is sure: in %, and never beyond a hundredth."""
+        found = {pedal: (use.released, use.remark(self.sources.get(pedal, ()))) for pedal, use in self._use.items()}
+        return {pedal: (sure, text) for pedal, (sure, text) in found.items() if text}
 
     def warm(self, signals: Iterable[str]) -> None:
         """Compile what the conversion of these signals needs, or read it from the cache."""

@@ -93,6 +93,15 @@ def test_a_slow_start_says_whether_it_compiled(log: Log, compiled: int, words: s
     ]
 
 
+def test_an_odd_pedal_is_told_once_and_warned_of_where_it_is_sure(log: Log) -> None:
+    says = Announcements(log)
+    warnings: list[str] = []
+    log.warning = warnings.append  # type: ignore[method-assign]
+    for shown in ("0.2 %", "0.3 %"):
+        says.pedals({"brake_pedal": (True, f"brake {shown}"), "accelerator_pedal": (False, f"accelerator {shown}")})
+    assert (log.lines, warnings) == (["accelerator 0.2 %"], ["brake 0.2 %"])
+
+
 def test_of_two_pedals_the_log_names_the_silent_one(log: Log) -> None:
     says = Announcements(log)
     says.prepared(prepared(1.0, 0))

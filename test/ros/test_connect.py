@@ -152,6 +152,60 @@ def test_a_car_with_four_rpm_topics_and_an_acceleration_demand_starts_from_rest(
     assert "axle lost" not in car.running.text()
 
 
+def test_wheels_on_topics_of_their_own_are_counted_however_slow_the_loop_is(connect: Callable[..., Connected]) -> None:
+    """Five messages of each come between two steps; of each the newest drives, and all of them count."""
+    sends = {"speed_kmh": TWIST, "wanted": ACCEL, "charge": NUMBER} | {f"rpm_{i}": NUMBER for i in range(4)}
+    periods = {f"input_period_s.{name}": 0.05 for name in ("vehicle_speed", "wheel_states", "power_demand")}
+    car = connect(FOUR_TOPICS, sends, {"power_manager/state": JOINTS}, rate_hz=10.0, **periods)
+
+    def inputs(stack: Stack) -> dict[str, Any]:
+        wanted = of_type(ACCEL, header__stamp=stack.stamp(), accel__linear__x=1.0)
+        wheels = {f"rpm_{i}": number(0.0) for i in range(4)}
+        return {"speed_kmh": of_type(TWIST), "wanted": wanted, "charge": number(80.0), **wheels}
+
+    states = car.stack.received["power_manager/state"]
+    car.stack.drive(inputs, lambda: "first torque" in car.running.text(), "torque", 0.02)
+    before = len(states)
+    car.stack.drive(inputs, lambda: len(states) > before + 40, "four seconds", 0.02)
+    assert "comes at" not in car.running.text()
+    assert "held up" not in car.running.text()
+
+    def slow() -> list[str]:
+        return [line for line in car.running.text().splitlines() if "comes at" in line and "WARN" in line]
+
+    car.stack.drive(inputs, slow, "that they are slow", 0.25)
+    car.stack.drive(inputs, lambda: len(states) > before + 80, "four more seconds", 0.25)
+    wheels = [line for line in slow() if "wheel_states" in line]
+    assert len(wheels) <= 1, "one line for the four of them"
+
+
+def test_pedals_of_another_unit_are_told(connect: Callable[..., Connected]) -> None:
+    """0..1 where the file says %: next to no torque, and a log that is normal otherwise."""
+    sends = {"odom": ODOMETRY, "joint_states": JOINTS} | dict.fromkeys(("pedals/accelerator", "pedals/brake"), NUMBER)
+    sends |= dict.fromkeys(("battery/charge", "battery/temperature"), "std_msgs/msg/Float32")
+    car = connect(share_path("config/signals/odometry_and_pedals.yaml"), sends)
+    accelerator = 0.0
+
+    def inputs(stack: Stack) -> dict[str, Any]:
+        names = [f"wheel_{wheel}_joint" for wheel in ("fl", "fr", "rl", "rr")]
+        return {
+            "odom": of_type(ODOMETRY, header__stamp=stack.stamp()),
+            "joint_states": of_type(JOINTS, header__stamp=stack.stamp(), name=names, velocity=[0.0] * 4),
+            "pedals/accelerator": number(accelerator),
+            "pedals/brake": number(0.0),
+            "battery/charge": of_type("std_msgs/msg/Float32", data=80.0),
+            "battery/temperature": of_type("std_msgs/msg/Float32", data=25.0),
+        }
+
+    log = car.running.text
+    car.stack.drive(inputs, lambda: "all inputs are there" in log(), "normal operation")
+    accelerator = 0.3
+    said = "signals.accelerator_pedal on /pedals/accelerator was held, and never beyond 0.3 %: where it is 0..1, write"
+    car.stack.drive(inputs, lambda: said in log(), "the unit")
+    (line,) = [line for line in log().splitlines() if said in line]
+    assert "WARN" in line
+
+
 ROS2_CONTROL = Path(__file__).resolve().parents[2] / "examples" / "ros2_control" / "signals.yaml"
 
 

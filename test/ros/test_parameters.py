@@ -13,9 +13,9 @@ from rclpy.parameter import Parameter
 from iwm_power_manager.control.thresholds import input_limits
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.nodes import power_manager_config as config
-from iwm_power_manager.ros.arguments import check_parameter_files
+from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.parameters import Change, Spec, check_change, descriptor
-from iwm_power_manager.ros.specs import markdown_table, yaml_text
+from iwm_power_manager.ros.specs import ParameterError, markdown_table, yaml_text
 
 SPECS = {
     spec.name: spec
@@ -220,3 +220,25 @@ def test_parameter_files_on_the_command_line_are_read_before_ros_does(tmp_path) 
     check_parameter_files(["node"])
     with pytest.raises(ConfigError, match=r"bad\.yaml: line"):
         check_parameter_files(["--ros-args", "--params-file", str(good), "--params-file", str(bad)])
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (["-p", "vehicle_file=van.yaml"], "-p 'vehicle_file=van.yaml' is not allowed; allowed: PARAMETER:=VALUE"),
+        (["-r", "/a:/b"], "-r '/a:/b' is not allowed; allowed: FROM:=TO"),
+        (
+            ["-p", "x:=1", "--param", "policy_file:="],
+            "PARAMETER:=VALUE; an empty text is \"policy_file:=''\": the shell takes quotes away",
+        ),
+    ],
+)
+def test_a_setting_that_ros_cannot_read_is_answered_with_how_it_is_written(given, words) -> None:
+    with pytest.raises(ParameterError) as caught:
+        check_arguments("node", "", [], ["node", "--ros-args", *given], examples="")
+    assert words in str(caught.value)
+
+
+def test_settings_that_ros_can_read_are_left_to_it() -> None:
+    right = ["-p", "policy_file:=''", "-r", "__ns:=/car_1", "--remap", "a:=b"]
+    check_arguments("node", "", [], ["node", "--ros-args", *right], examples="")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import time
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -261,6 +262,19 @@ def test_a_bench_that_was_started_over_is_no_wrong_unit(start_own) -> None:
     bench.drive(lambda: bench.mode() == 1 and sensors() == "ok", "belief", speed=0.0, demand=0.0)
 
 
+def test_a_bench_that_was_away_and_stands_is_believed_without_a_new_activation(start_own) -> None:
+    pair = start_own()
+    bench = pair.bench
+    bench.connect()
+    bench.drive(lambda: bench.mode() == 1 and bench.last("doubted") == 0, "normal operation", demand=0.0)
+    away_until_s = time.monotonic() + 1.0
+    bench.spin_until(lambda: time.monotonic() > away_until_s and bench.last("stale") == 15, "its absence")
+    bench.drive(lambda: bench.last("doubted") == 31, "doubt", speed=0.0, demand=0.0)
+    bench.drive(lambda: bench.last("doubted") == 0 and bench.mode() == 1, "belief", speed=0.0, demand=0.0)
+    assert "the car was started over: it starts over, as after activation" in pair.running.text()
+    bench.drive(lambda: bench.last("front_left_motor_torque_nm") > 30.0, "torque", speed=0.0, demand=500.0)
+
+
 def test_inputs_that_come_too_slowly_are_named_with_their_rate(start_own) -> None:
     """Their periods were not said: the node that never starts to drive says why, again and again."""
     pair = start_own()
@@ -295,6 +309,8 @@ def test_a_rate_is_told_whatever_pause_was_in_between() -> None:
     assert rate_hz(fifty) == pytest.approx(50.0)
     assert rate_hz(fifty[:4]) == math.inf
     assert rate_hz([1] * 9) == math.inf
+    often = [int(20e6 * i + 5e8 * (i // 4)) for i in range(32)]  # the node was busy again and again
+    assert rate_hz(often) == pytest.approx(50.0)
 
 
 def test_a_wheel_that_never_comes_is_named_while_the_others_drive(start_own) -> None:
