@@ -98,12 +98,19 @@ def walk(data: Bytes, offset: int = len(MAGIC)) -> Iterator[Record]:
     for _ in range(limits.MAX_RECORDS):
         if offset >= size:
             return
+        check_whole(data)
         record = _record_at(data, offset) or Record(UNREADABLE, offset, offset, _next_chunk(data, offset + 1))
         yield record
         if record.opcode == Opcode.FOOTER:
             return
         offset = record.end
     raise BagError(f"holds more than {limits.MAX_RECORDS} records")
+
+
+def check_whole(data: Bytes) -> None:
+    """`BagError` if a mapped file has become shorter: to look at what is gone ends the process."""
+    if isinstance(data, mmap.mmap) and data.size() < len(data):
+        raise BagError("was cut off while it was read")
 
 
 def _record_at(data: Bytes, offset: int) -> Record | None:
@@ -283,7 +290,7 @@ class McapSource:
         """Go through all records; returns the summary's statistics, if the file was finished."""
         statistics: Statistics | None = None
         record = None
-        for record in walk(self.data):
+        for record in self.records():
             found = record.content
             if record.opcode == Opcode.CHUNK:
                 self._pieces.append(Piece(_SPAN.unpack_from(self.data, record.body)[0], record))
@@ -311,6 +318,13 @@ class McapSource:
             self.note("its summary is damaged")
             return None
         return None if self.damage else statistics
+
+    def records(self) -> Iterator[Record]:
+        """All records; `BagError` if there are too many, or the file has become shorter."""
+        try:
+            yield from walk(self.data)
+        except BagError as error:
+            raise BagError(f"{self.path}: {error}") from None
 
     def _add_to_run(self, record: Record) -> None:
         """A message outside of chunks: the run it belongs to is read in one piece, like a chunk."""
@@ -367,6 +381,7 @@ class McapSource:
         """Messages of a chunk in the order of the file; none, and a line of damage, if it cannot be unpacked."""
         record = piece.record
         try:
+            check_whole(self.data)
             return split(
                 self.raw(record) if record.opcode == Opcode.CHUNK else self.data[record.start : record.end],
                 self.definitions,

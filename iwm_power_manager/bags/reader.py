@@ -166,7 +166,11 @@ class BagReader:
         names = [self.path / name for name in listed_files(self.information)]
         present = [name for name in names if os.path.exists(name)]
         self._damage += [f"{name}: is missing" for name in names if name not in present]
-        return present or data_files(self.path)
+        there = data_files(self.path)
+        self._damage += [
+            f"{name}: is not in metadata.yaml and left out" for name in there if present and name not in present
+        ]
+        return present or there
 
 
 def listed_files(information: Mapping[str, Any]) -> dict[str, None]:

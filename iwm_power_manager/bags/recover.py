@@ -297,7 +297,7 @@ def _copy(source: reader.Source, target: Path) -> tuple[int, int]:
                 numbers[number] = writer.register_channel(
                     channel.topic, channel.message_encoding, key, channel.metadata
                 )
-            for record in mcap_source.walk(source.data):
+            for record in source.records():
                 found, raw = record.content, source.data[record.start : record.end]
                 if record.opcode == Opcode.CHUNK:
                     try:

@@ -145,6 +145,9 @@ class SqliteSource:
     def _count(self) -> None:
         """Messages by topic, if the file is whole: each page of it is looked at."""
         try:
+            pages = self._database.execute("SELECT page_size * page_count FROM pragma_page_size, pragma_page_count")
+            if pages.fetchone()[0] > limits.regular_file(self.path):
+                self.note("ends within its last page: what stood there is lost")
             (problem,) = self._database.execute("PRAGMA quick_check(1)").fetchone()
             if problem != "ok":
                 self.note(f"is damaged: {' '.join(problem.split())}")

@@ -209,6 +209,8 @@ def _advance(times: Sequence[tuple[int, int]]) -> bool:
 def _types(bag: BagReader, name: str) -> Types:
     """The types of a recorded topic by the definition in its bag."""
     topic = bag.topics[name]
+    if topic.serialization.lower() not in ("cdr", ""):
+        raise BagError(f"{name}: its messages are {topic.serialization!r}, not CDR")
     sample = b""
     if "wstring" in topic.definition:  # how wide its characters are, only a message tells
         first = first_message(bag, name)

@@ -133,9 +133,9 @@ class Replay:
 
     def _other_unit(self) -> list[str]:
         """A line, if speed and wheel speeds cannot both be in the unit they were read in."""
-        if min(self._shown_mps, self._rolled_mps) < _MOVING_MPS:
+        if max(self._shown_mps, self._rolled_mps) < _MOVING_MPS:
             return []
-        ratio = self._shown_mps / self._rolled_mps
+        ratio = self._shown_mps / self._rolled_mps if self._rolled_mps else math.inf
         if 1.0 / _APART < ratio < _APART:
             return []
         likely = {**_LIKELY, 1.0 / self._radius_m: "wheel_speed in m/s"}

@@ -61,8 +61,8 @@ FloatArray = NDArray[np.float64]
 _PAUSE_S = 1.0
 #: Values from the start of a bag that show whether its messages come in sets of one stamp.
 _PROBE_VALUES = 400
-#: Below this share of the messages of the busiest topic, a replay says that it made few steps.
-_FEW_STEPS = 0.1
+#: Below this share of the messages of the busiest topic, or of the wheel speeds, a replay says that it made few steps.
+_FEW_STEPS, _STEPS_LACK = 0.1, 0.9
 STATE_READER = joint_state_reader("position")
 
 
@@ -332,6 +332,8 @@ class ReconstructedSteps:
         standing = stream.use_log_times(probe)
         report.notes += [*stream.problems, *filter(None, [standing])]
         self._in_sets = not standing and _in_sets([value for _, value in probe[:_PROBE_VALUES]])
+        self._wheels = self._again = 0  # wheel speeds, and those of them with the stamp of the one before
+        self._wheels_ns = -1
         vehicle = plan.vehicle.params
         judged = input_limits(RECORDED, vehicle.front.wheel.radius_m, by_clock=False)
         limits = ControllerLimits(judged, None, supervision_limits(RECORDED), actuator_limits(RECORDED))
@@ -370,6 +372,8 @@ class ReconstructedSteps:
         ]
         for name, reasons in self.not_believed().items():
             parts.append(f"{name} not believed: " + ", ".join(f"{count} {reason}" for reason, count in reasons.items()))
+        if self._again:
+            parts.append(f"{self._again} wheel speeds with the stamp of the one before")
         parts += [f"{count} without a command: {reason}" for reason, count in self._report.faults.items()]
         return "; ".join([*parts, *self._report.notes]) or "no message"
 
@@ -383,6 +387,8 @@ class ReconstructedSteps:
         most = max(stream.taken[topic] for topic in stream.topics)
         if 0 < steps <= _FEW_STEPS * most:
             found.append(f"only {steps} steps of {most} messages: {self.why_none()}")
+        elif 0 < steps < _STEPS_LACK * self._wheels:
+            found.append(f"only {steps} steps of {self._wheels} wheel speeds: {self.why_none()}")
         return found
 
     def _of(self, values: Sequence[Recorded]) -> list[ReplayedStep]:
@@ -390,6 +396,10 @@ class ReconstructedSteps:
         for value in values:
             reading: Any = value.reading
             topic = _TOPICS.get(type(reading))
+            if topic == monitor.WHEELS:
+                self._wheels += 1
+                self._again += reading.stamp_ns == self._wheels_ns
+                self._wheels_ns = reading.stamp_ns
             if topic == monitor.FRICTION:
                 self._friction(reading.friction, reading.stamp_ns)
             elif topic is not None:

@@ -125,7 +125,7 @@ def _types_of(msgtype: str, encoding: str, text: str, wide: str) -> Types:
     except BagError as error:
         raise BagError(f"type {msgtype}: {error}") from None
     except Exception as error:  # noqa: BLE001 - parser and code generator raise anything at a text that is none
-        raise BagError(f"type {msgtype}: its definition cannot be read: {_first_line(error)}") from None
+        raise BagError(f"type {msgtype}: its definition cannot be read{_place(error)}") from None
     return Types(store, name)
 
 
@@ -251,7 +251,9 @@ def _measure(name: str, types: dict[str, Any]) -> None:
     size(name, 0)
 
 
-def _first_line(error: Exception) -> str:
-    """What a parser says, without the whole text that rosbags puts into its message."""
+def _place(error: Exception) -> str:
+    """Where a parser stopped, without the whole text that rosbags puts into its message."""
+    if isinstance(error, RecursionError):
+        return ": is nested too deep"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return f"{type(error).__name__} at {lines[-1][:80]!r}" if lines else type(error).__name__
+    return f", at {lines[-1][:80]!r}" if lines else ""

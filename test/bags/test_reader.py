@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import os
 import random
+import shutil
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
@@ -234,6 +236,36 @@ def test_qos_of_every_rosbag2_version_is_understood() -> None:
     assert profile.durability.name == "TRANSIENT_LOCAL"
     assert (profile.depth, profile.deadline, profile.lifespan) == (5, (0, 7), (1, 0))
     assert parse_qos("") == parse_qos("nonsense") == parse_qos("[1, 2]") == parse_qos("{") == ()
+
+
+def test_a_file_that_is_cut_off_while_it_is_read_is_damage_and_no_end_of_the_process(
+    make_bag: Callable[..., Path],
+) -> None:
+    path = make_bag([("/a", i, float(i)) for i in range(3000)], chunk_bytes=1024, compression="none")
+    file = path / "bag_0.mcap"
+    with BagReader(path) as reader:
+        messages = reader.messages()
+        before = [next(messages) for _ in range(100)]
+        os.truncate(file, 8192)
+        after = list(messages)
+        assert 0 < len(before) + len(after) < 3000
+        assert any("was cut off while it was read" in line for line in reader.damage)
+
+
+def test_a_data_file_that_metadata_does_not_list_is_said_to_be_left_out(make_bag: Callable[..., Path]) -> None:
+    path = make_bag([("/a", i, 0.0) for i in range(10)])
+    shutil.copy(path / "bag_0.mcap", path / "bag_1.mcap")
+    with BagReader(path) as reader:
+        assert reader.damage == [f"{path / 'bag_1.mcap'}: is not in metadata.yaml and left out"]
+        assert len(list(reader.messages())) == 10
+
+
+def test_a_database_without_its_last_byte_is_damaged(tmp_path: Path) -> None:
+    path = written_by_rosbags(tmp_path / "bag", StoragePlugin.SQLITE3)
+    (file,) = path.glob("*.db3")
+    file.write_bytes(file.read_bytes()[:-1])
+    with BagReader(path) as reader:
+        assert any("ends within its last page" in line for line in reader.damage)
 
 
 @pytest.mark.parametrize("opened", [BagReader, recover], ids=["read", "recovered"])

@@ -156,6 +156,8 @@ def test_a_wheel_that_is_not_believed_is_said_with_how_often(
             "speed is 0.278 times what wheel_speed and a radius of 0.33 m give: speed in m/s, read as km/h?",
         ),
         (1.0, 0.33, "speed is 3.03 times what wheel_speed and a radius of 0.33 m give: wheel_speed in m/s?"),
+        (0.0, 1.0, "speed is 0 times"),
+        (1.0, 0.0, "speed is inf times"),
         (1.0, 0.6, "another unit, or another wheel radius?"),
         (1.0, 1.1, ""),
     ],
@@ -202,6 +204,22 @@ def test_a_bag_that_gives_no_step_says_why_topic_by_topic(
         assert "gave no control step: " in line
         assert f"/joint_states: {COUNT} messages, {COUNT} of them bad" in line
         assert f"/demand: {COUNT} messages" in line
+
+
+def test_messages_that_are_no_cdr_are_not_read_as_such(
+    tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = write_bag(tmp_path / "bag", drive(), with_speed(serialization="json"))
+    assert main([str(bag), "--mapping", str(mapping), "--strategy", "equal"]) == BAD_INPUT
+    assert "/car/speed: its messages are 'json', not CDR" in capsys.readouterr().err
+
+
+def test_stamps_that_stand_still_from_some_time_on_are_said(tmp_path: Path, mapping: Path) -> None:
+    last = foreign.START_NS + COUNT // 2 * foreign.PERIOD_NS
+    report, _ = replayed(write_bag(tmp_path / "bag", drive(stamp=lambda log_ns: min(log_ns, last))), mapping)
+    (note,) = report.notes
+    assert note.startswith(f"only {COUNT // 2 + 1} steps of {COUNT} wheel speeds")
+    assert f"{COUNT // 2 - 1} wheel speeds with the stamp of the one before" in note
 
 
 def test_far_fewer_steps_than_messages_are_said(tmp_path: Path, mapping: Path) -> None:
