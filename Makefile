@@ -36,7 +36,7 @@ unseen: setup-run  ## Our strategy on cycles and cars that were not there when i
 roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside what is required (2 min)
 	@$(BIN)/python -m campaigns.roads --unknown --page docs/roads.md $(ARGS)
 
-docs-numbers: setup-run  ## Fill the numbers of README and docs: stored study and commands (2 min)
+docs-numbers: setup-run  ## Fill the numbers of README and docs: stored results and commands (5 min; ARGS=--study: seconds)
 	@$(BIN)/python scripts/docs_numbers $(ARGS)
 
 bench: bench-peers  ## All that has to be fast, each beside its peer, in one table, then control path and signals (an hour)

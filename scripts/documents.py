@@ -1,50 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers in documents: what stands between two markers of a Markdown page is made, not typed.
+"""Numbers in documents: what stands between two markers of a Markdown page is made by a command, not typed.
 
-`<!-- study: NAME -->` ... `<!-- end -->` is filled from the stored study by the function of that name in `BLOCKS`;
-`<!-- run: COMMAND -->` ... `<!-- end -->` holds what the command printed, below the command. `scripts/docs_numbers`
-fills both. What takes too long, or another machine, stands between `<!-- measured: COMMAND -->` and `<!-- end -->`: by
-hand, and the marker says what prints it.
+Between `<!-- KIND: NAME -->` and `<!-- end -->` stands, by its kind,
+
+- study, unseen: what the function of that name in `STUDY` or `UNSEEN` says of docs/study.json or docs/unseen.json;
+- measured: the table that a benchmark makes of the JSON it left beside the page (`MEASURED`);
+- run: a command and what it printed;
+- slow: the same of what takes minutes: it is run only where it is asked for.
+
+`scripts/docs_numbers` fills all of them.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import operator
 import re
-from collections.abc import Callable
+import runpy
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from iwm_power_manager.control.budget import DEAREST, bucket
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
-from iwm_sim.study import labels, paper
+from iwm_sim.study import labels, paper, unseen
 from iwm_sim.study.answers import answers, savings
-from iwm_sim.study.content import Study
+from iwm_sim.study.content import Study, rounded
+from iwm_sim.study.frontier import COUNTS, Frontier, margin
 from iwm_sim.study.plan import IDLE_DRIVES
 from iwm_sim.study.report import Column, format_value
 from iwm_sim.study.rows import Place, Row, by_place
 from iwm_sim.study.study_tables import in_order
 from iwm_sim.study.tables import markdown_table
 
-_BLOCK = re.compile(r"<!-- (study|run|measured): (.+?) -->\n(.*?)<!-- end -->", re.DOTALL)
+_BLOCK = re.compile(r"<!-- (study|unseen|measured|run|slow): (.+?) -->\n(.*?)<!-- end -->", re.DOTALL)
+_ROOT = Path(__file__).resolve().parents[1]
 
 #: The strongest simple rival, at the price it has by default.
 RIVAL = f"{labels.INSTANTANEOUS_SLIP} {DEFAULTS.switching_power_w:g} W"
 
 
-def filled(text: str, study: Study, run: Callable[[str], str] | None = None) -> str:
+class Stored(NamedTuple):
+    """What long runs left: the study, and `unseen_summary` of `evaluate --unseen`."""
+
+    study: Study
+    unseen: dict[str, Any]
+
+    @classmethod
+    def load(cls) -> Stored:
+        """What docs/ holds."""
+        unseen = json.loads((_ROOT / "docs" / "unseen.json").read_text(encoding="utf-8"))
+        return cls(Study.load(_ROOT / "docs" / "study.json"), unseen)
+
+
+def filled(text: str, stored: Stored, run: Callable[[str], str] | None = None, slow: bool = False) -> str:
     """A page with its blocks filled; those of commands only where there is a `run`, which gives what one printed."""
 
     def block(match: re.Match[str]) -> str:
         kind, name, old = match.groups()
         if kind == "measured":
-            return match.group(0)
-        if kind == "study":
-            new = BLOCKS[name](study)
-        elif run is not None:
-            new = f"```\n$ {name}\n{run(name).rstrip()}\n```"
+            new = MEASURED[name]()
+        elif kind in ("run", "slow"):
+            here = run is not None and (kind == "run" or slow)
+            new = f"```\n$ {name}\n{run(name).rstrip()}\n```" if run is not None and here else old
         else:
-            new = old.strip()
+            new = STUDY[name](stored.study) if kind == "study" else UNSEEN[name](stored.unseen)
         return f"<!-- {kind}: {name} -->\n{new.strip()}\n<!-- end -->"
 
     return _BLOCK.sub(block, text)
@@ -52,12 +76,7 @@ def filled(text: str, study: Study, run: Callable[[str], str] | None = None) -> 
 
 def commands(text: str) -> list[tuple[str, str]]:
     """Commands of a page's blocks, and what stands there."""
-    return [(name, content) for kind, name, content in _BLOCK.findall(text) if kind == "run"]
-
-
-def measurements(text: str) -> list[str]:
-    """Commands that print what a page holds by hand."""
-    return [name for kind, name, _ in _BLOCK.findall(text) if kind == "measured"]
+    return [(name, content) for kind, name, content in _BLOCK.findall(text) if kind in ("run", "slow")]
 
 
 def without_blocks(text: str) -> str:
@@ -157,11 +176,220 @@ def policies_named(text: str) -> set[str]:
     return {word[:8] for found in re.findall(named, text) for word in re.findall(r"[0-9a-f]{8,64}", found)}
 
 
-BLOCKS: dict[str, Callable[[Study], str]] = {
+STUDY: dict[str, Callable[[Study], str]] = {
     "savings": savings_table,
     "summary": summary,
     "energy": energy,
     "by friction": by_friction,
     "policies": policies,
     "trials": trials,
+}
+
+
+# --- drives and cars that nobody chose -------------------------------------------------------------------------------
+
+
+def unseen_summary(frontiers: Sequence[Frontier]) -> dict[str, Any]:
+    """What the pages say of `evaluate --unseen`, as plain values."""
+    judged = []
+    for f in frontiers:
+        margins = [value for count in COUNTS if (value := margin(f.ours[0], f.rivals, count)) is not None]
+        if margins:
+            judged.append((f, f.ours[0], margins))
+    worst = sorted(judged, key=lambda cell: cell[2][0])[:10]
+    alone = [cell for cell in judged if not _has_rival(cell[0])]
+    drawn = [cell for cell in alone if cell[0].label.startswith("car ")]
+    found = {
+        "made_with": unseen.common(frontiers),
+        "cells": len(frontiers),
+        "judged": len(judged),
+        "alone": len(alone),
+        "alone_drawn": len(drawn),
+        "busiest_minute": max(point.busiest_minute for _, point, _ in judged),
+        "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in unseen.judge(frontiers)],
+        "kinds": [kind._asdict() for kind in unseen.kinds(frontiers)],
+        "with_rivals": _margins([cell[2] for cell in judged if _has_rival(cell[0])]),
+        "close_by_kind": {
+            name: _margins([cell[2] for cell in judged if name in (unseen.kind_of(cell[0].label), "all")])
+            for name in [kind.name for kind in unseen.kinds(frontiers)]
+        },
+        "papers_car": _margins([cell[2] for cell in judged if not cell[0].label.startswith("car ")]),
+        "worst": [[margins[0], point.saving_percent, point.changes_per_min, f.label] for f, point, margins in worst],
+    }
+    papers_car = frontiers[0].label.partition(",")[0]
+    renamed: dict[str, Any] = json.loads(json.dumps(rounded(found)).replace(papers_car, "paper's car"))
+    return renamed
+
+
+def _has_rival(f: Frontier) -> bool:
+    """Whether any threshold changes the split no more often than ours."""
+    most = f.ours[0].changes_per_min + 1e-9
+    return any(r.held and r.saving_percent is not None and r.changes_per_min <= most for r in f.rivals)
+
+
+def _margins(rows: Sequence[Sequence[float]]) -> dict[str, Any]:
+    """Of the first way of counting; and the part that is close, in each."""
+    first = [row[0] for row in rows]
+    close = [sum(value >= -unseen.CLOSE for value in column) / len(rows) for column in zip(*rows, strict=True)]
+    numbers = {"mean": statistics.fmean(first), "median": statistics.median(first), "worst": min(first)}
+    return {"cells": len(rows), "behind": sum(value < -unseen.CLOSE for value in first), "close": close, **numbers}
+
+
+def unseen_answer(found: dict[str, Any]) -> str:
+    """The question and its answer."""
+    whole = found["kinds"][-1]
+    return (
+        "- **What is it worth where nobody chose the drive?** On generated cycles and drawn cars that were not there "
+        f"when the policy was made, our policy saves {whole['mean']:.2f} % in the mean against equal split, "
+        f"{format_value(whole['worst'], 2)} % at worst; at the same number of changes the best simple rival saves "
+        f"{whole['margin']:.3f} points less in the mean, and {-whole['worst_margin']:.3f} more at worst "
+        f"({found['made_with'].partition(', control')[0]})."
+    )
+
+
+def unseen_kinds(found: dict[str, Any]) -> str:
+    """Savings and margins by kind of cell."""
+    table = markdown_table([unseen.Kind(**kind) for kind in found["kinds"]], unseen.KIND_COLUMNS)
+    return (
+        "Generated cycles on the paper's car, as they are or logged with noise, and drawn cars with three cycles each "
+        f"({found['made_with']}): battery energy saved against equal split, and that less the saving of the best rival "
+        "(`instantaneous_slip` at any threshold, `instantaneous`, equal split) with no more changes of the split:\n\n"
+        f"{table}\n\n{found['cells'] - found['judged']} of {found['cells']} cells do not count: the trace was lost. In "
+        f"{found['alone']} ({found['alone_drawn']} of them drawn cars) every rival changes more often, so that only "
+        "equal split is left and the margin is our whole saving. Ours is at most "
+        f"{unseen.CLOSE:g} points behind in {100 * found['verdicts'][0]['part_close']:.1f} % of the cells."
+    )
+
+
+def unseen_verdicts(found: dict[str, Any]) -> str:
+    """The judgement, with what to know before its mean is read."""
+    rivals, own = found["with_rivals"], found["papers_car"]
+    columns: list[Column[dict[str, Any]]] = [
+        Column("changes counted", lambda row: _COUNTED[row["counted"]]),
+        Column("cells", lambda row: row["cells"], decimals=0),
+        Column("mean", lambda row: row["mean"], "points", 3, group="margin:"),
+        Column("lowest twentieth below", lambda row: row["lowest_twentieth"], "points", 3, group="margin:"),
+        Column("worst", lambda row: row["worst"], "points", 3, group="margin:"),
+        Column(f"at most {unseen.CLOSE:g} behind", lambda row: 100.0 * row["part_close"], "%", 1),
+        Column("aim", lambda row: "reached" if row["reached"] else "not reached"),
+    ]
+    return (
+        f"{markdown_table(found['verdicts'], columns)}\n\n"
+        f"{found['cells'] - found['judged']} of {found['cells']} cells do not count: equal split or ours lost the "
+        f"trace there ({found['made_with']}).\n\n"
+        f"**Read the mean with care.** In {found['alone']} of the {found['judged']} cells every threshold up to 200 W "
+        "changes more often than ours, so that only equal split is left to compare with, and the margin is our whole "
+        f"saving. In the other {rivals['cells']} cells: mean {rivals['mean']:+.3f}, median {rivals['median']:+.3f}, "
+        f"worst {rivals['worst']:+.3f}, {100 * rivals['close'][0]:.1f} % at most {unseen.CLOSE:g} behind. The paper's "
+        f"car alone: {own['cells']} cells, mean {own['mean']:+.3f}, median {own['median']:+.3f}, "
+        f"{100 * own['close'][0]:.1f} %."
+    )
+
+
+def unseen_worst(found: dict[str, Any]) -> str:
+    """The worst cells, and how many of each kind are behind."""
+    worst: list[Column[list[Any]]] = [
+        Column("margin", lambda row: row[0], "points", 3),
+        Column("saving", lambda row: row[1], "%", 3),
+        Column("changes", lambda row: row[2], "1/min", 1),
+        Column("cell", lambda row: row[3]),
+    ]
+    kinds: list[Column[tuple[str, dict[str, Any]]]] = [
+        Column("kind", lambda row: row[0]),
+        Column("cells", lambda row: row[1]["cells"], decimals=0),
+        Column("> 0.25", lambda row: 100.0 * row[1]["close"][0], "%", 1),
+        Column("> 0.05", lambda row: 100.0 * row[1]["close"][1], "%", 1),
+        Column("moves", lambda row: 100.0 * row[1]["close"][2], "%", 1),
+        Column("behind, in the first count", lambda row: row[1]["behind"], decimals=0),
+    ]
+    return (
+        "The worst cells, with the saving and the changes a minute of ours:\n\n"
+        f"{markdown_table(found['worst'], worst)}\n\n"
+        f"The busiest minute of all had {found['busiest_minute']} changes; the promise is 8 and a burst of 16.\n\n"
+        f"By kind of cell, at most {unseen.CLOSE:g} behind when changes by more than 0.25, by more than 0.05, and all "
+        f"moves are counted:\n\n{markdown_table(list(found['close_by_kind'].items()), kinds)}"
+    )
+
+
+_COUNTED = dict(zip(COUNTS, ("by more than 0.25", "by more than 0.05", "sum of moves"), strict=True))
+
+UNSEEN: dict[str, Callable[[dict[str, Any]], str]] = {
+    "answer": unseen_answer,
+    "kinds": unseen_kinds,
+    "verdicts": unseen_verdicts,
+    "worst": unseen_worst,
+}
+
+
+# --- benchmarks ------------------------------------------------------------------------------------------------------
+
+
+def _of_benchmark(name: str, make: str, stored: str) -> str:
+    """What a benchmark's function makes of the numbers it stored."""
+    program = runpy.run_path(str(_ROOT / "benchmarks" / f"{name}.py"))
+    return str(program[make](json.loads((_ROOT / "docs" / stored).read_text(encoding="utf-8"))))
+
+
+def _mutants() -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = json.loads((_ROOT / "docs" / "mutation.json").read_text(encoding="utf-8"))["rows"]
+    return rows
+
+
+def mutation_table() -> str:
+    """How many changes of each module the tests noticed."""
+    columns: list[Column[dict[str, Any]]] = [
+        Column("module", lambda row: row["module"]),
+        *(Column(name, operator.itemgetter(name), decimals=0) for name in ("places", "mutants", "killed")),
+        Column("percent", lambda row: row["percent"], decimals=1),
+    ]
+    return markdown_table(_mutants(), columns)
+
+
+def mutation_sentence() -> str:
+    """The same in a sentence."""
+    *modules, whole = _mutants()
+    least = min(modules, key=lambda row: float(row["percent"]))
+    return (
+        f"All {whole['mutants']} changes that `make mutation` made in these modules in version 0.1.0 were tried, and "
+        f"{whole['killed']} of them ({whole['percent']:.1f} %) made a test fail; the least of any module is "
+        f"{least['percent']:.1f} % (`{least['module']}.py`). [mutation.md](mutation.md) has the table and says of each "
+        "survivor why no test can tell."
+    )
+
+
+def soak_table() -> str:
+    """Half hours at 100 Hz, as `make soak` stored them."""
+    runs = json.loads((_ROOT / "docs" / "soak.json").read_text(encoding="utf-8"))
+    columns: list[Column[dict[str, Any]]] = [
+        Column("run", lambda row: row["run"]),
+        Column("steps", lambda row: row["steps"], decimals=0),
+        Column("late", lambda row: row["late"], decimals=0),
+        Column("not explained by the machine", lambda row: row["late_by_itself"], decimals=0),
+        Column("a step's processor time, by minute", lambda row: "{:.2f} to {:.2f} ms".format(*row["step_ms"])),
+        Column("processors stood still", lambda row: f"{row['stood_still']} times, {row['stood_still_s']:.1f} s"),
+    ]
+    return markdown_table(runs, columns)
+
+
+def faults_table() -> str:
+    """What `make faults` stored; a row may stand for several faults that end alike."""
+    rows = json.loads((_ROOT / "docs" / "faults.json").read_text(encoding="utf-8"))
+    columns: list[Column[dict[str, Any]]] = [
+        Column("fault", lambda row: row["name"]),
+        Column("must", lambda row: row["expect"]),
+        Column("zero torque after", lambda row: row["to_zero_s"], "s", 2),
+        Column("torque later", lambda row: row["largest_nm"], "N m", 1),
+        Column("normal again", lambda row: row["recovery_s"], "s", 2),
+        Column("reported", lambda row: row["said"].split(";")[0]),
+    ]
+    return markdown_table(rows, columns)
+
+
+MEASURED: dict[str, Callable[[], str]] = {
+    "make faults": faults_table,
+    "make mutation: table": mutation_table,
+    "make mutation: sentence": mutation_sentence,
+    "make soak": soak_table,
+    "benchmarks/performance.py": lambda: _of_benchmark("performance", "table", "performance.json"),
+    "benchmarks/fleet.py": lambda: _of_benchmark("fleet", "text", "scale.json"),
 }

@@ -333,6 +333,7 @@ def serve(feed: Feed, port: int, *, open_browser: bool) -> None:
 
     # A closed tab is no news.
     logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)
+    logging.getLogger("tornado.application").addFilter(lambda record: "GET /ws" not in record.getMessage())
     application = Application(FunctionHandler(lambda document: make_page(document, feed)))
     try:
         server = Server({"/": application}, address="127.0.0.1", port=port)

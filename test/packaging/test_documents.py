@@ -14,7 +14,7 @@ import pytest
 
 import documents
 from iwm_power_manager.policy import load_policy
-from iwm_sim.study.content import Study
+from iwm_sim.study.frontier import Frontier, Point
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
@@ -36,8 +36,8 @@ GENERATED = re.compile(
 
 
 @pytest.fixture(scope="module")
-def study() -> Study:
-    return Study.load(ROOT / "docs" / "study.json")
+def stored() -> documents.Stored:
+    return documents.Stored.load()
 
 
 def printed() -> set[str]:
@@ -48,15 +48,15 @@ def printed() -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_what_comes_from_the_study_is_what_the_study_says(page: Path, study: Study) -> None:
+def test_what_comes_from_stored_results_is_what_they_say(page: Path, stored: documents.Stored) -> None:
     text = page.read_text(encoding="utf-8")
-    assert documents.filled(text, study) == text, "run: scripts/docs_numbers --study"
+    assert documents.filled(text, stored) == text, "run: scripts/docs_numbers --study"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_every_transcript_begins_with_its_command_which_there_is(page: Path) -> None:
     for command, content in documents.commands(page.read_text(encoding="utf-8")):
-        assert content.startswith(f"```\n$ {command}\n")
+        assert re.fullmatch(rf"```\n\$ {re.escape(command)}\n[^`]*\n```\n", content), "only what the command printed"
         program = command.split()[0]
         assert shutil.which(program, path=f"{Path(sys.executable).parent}:/usr/bin:/bin"), program
 
@@ -74,23 +74,17 @@ def typed_results(page: str) -> list[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_no_result_is_typed(page: Path, study: Study) -> None:
-    allowed = printed() | {f"{value:.2f}" for value in vars(study.paper).values() if isinstance(value, float)}
+def test_no_result_is_typed(page: Path, stored: documents.Stored) -> None:
+    allowed = printed() | {f"{value:.2f}" for value in vars(stored.study.paper).values() if isinstance(value, float)}
     typed = [result for result in typed_results(page.read_text(encoding="utf-8")) if result not in allowed]
     assert not typed, "put them between markers (scripts/documents.py)"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_what_is_measured_by_hand_names_what_prints_it(page: Path) -> None:
-    targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
-    for command in documents.measurements(page.read_text(encoding="utf-8")):
-        program, *rest = command.split()
-        if program == "make":
-            assert rest[0] in targets
-        elif program == "pytest":
-            assert (ROOT / rest[-1]).is_file()
-        else:
-            assert (ROOT / program).is_file() or shutil.which(program, path=str(Path(sys.executable).parent)), command
+def test_there_is_no_block_that_no_command_fills(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert not re.findall(r"<!-- [a-z]+: .*? -->", documents.without_blocks(GENERATED.sub("", text)))
+    assert all(name in documents.MEASURED for name in re.findall(r"<!-- measured: (.*?) -->", text))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -123,12 +117,38 @@ def test_a_typed_result_is_found() -> None:
     assert typed_results("```\nreplay drive --set gain=0.5\n```\n") == []
     assert typed_results(f"A step takes 1.25 ms.\n\n{table}") == ["1.25", "| a | b |"]
     assert typed_results(f"<!-- measured: make soak -->\n0.5 ms\n{table}<!-- end -->\n") == []
+    assert typed_results("<!-- by hand: make soak -->\n0.5 ms\n<!-- end -->\n") == ["0.5"]
 
 
-def test_a_commands_output_is_filled_and_the_rest_stays(study: Study) -> None:
-    text = "a\n<!-- run: echo hi -->\nold\n<!-- end -->\nb\n"
-    assert documents.filled(text, study, lambda command: f"{command}!\n") == (
+def test_a_commands_output_is_filled_and_the_rest_stays(stored: documents.Stored) -> None:
+    text = "a\n<!-- run: echo hi -->\nold\n<!-- end -->\nb\n<!-- slow: ls -->\nold\n<!-- end -->\n"
+    quick = documents.filled(text, stored, lambda command: f"{command}!\n")
+    assert quick == (
         "a\n<!-- run: echo hi -->\n```\n$ echo hi\necho hi!\n```\n<!-- end -->\nb\n"
+        "<!-- slow: ls -->\nold\n<!-- end -->\n"
     )
-    assert documents.filled(text, study) == text
+    assert "$ ls\nls!\n" in documents.filled(text, stored, lambda command: f"{command}!\n", slow=True)
+    assert documents.filled(text, stored) == text
     assert "hi" not in documents.without_blocks(text)
+
+
+def test_of_cells_that_nobody_chose_the_worst_and_those_without_a_rival_are_counted() -> None:
+    def point(strategy: str, saving: float, changes: float) -> Point:
+        return Point(strategy, 0.0, saving, changes, changes, changes, int(changes), held=True, policy="coupled 1")
+
+    def cell(label: str, ours: float, rival_changes: float) -> Frontier:
+        rivals = (point("instantaneous_slip", 1.0, rival_changes),)
+        return Frontier(label, "friction 0.9, idle drive drag", rivals, (point("sdp_lookahead", ours, 5.0),), ())
+
+    found = documents.unseen_summary(
+        [
+            cell("a_car, cycle 1, friction 0.9", 0.5, 4.0),
+            cell("a_car, cycle 2, friction 0.9", 0.4, 9.0),
+            cell("car 7, cycle 3, friction 0.9", 2.0, 4.0),
+        ]
+    )
+    assert (found["judged"], found["alone"], found["alone_drawn"], found["busiest_minute"]) == (3, 1, 0, 5)
+    assert found["worst"][0] == [-0.5, 0.5, 5.0, "paper's car, cycle 1, friction 0.9"]
+    assert found["with_rivals"]["mean"] == pytest.approx(0.25)
+    assert found["close_by_kind"]["paper's car, friction 0.9"]["close"] == [0.5, 0.5, 0.5]
+    assert "| paper's car, friction 0.9 | 2 | 50.0 |" in documents.unseen_worst(found)
