@@ -42,7 +42,11 @@ params = load_vehicle(resolve("jalalmaab_2015")).params
 table = load_policy(resolve("jalalmaab_2015_drag_coupled_mu090")).table()
 discharge, charge = found("battery_limits_w", "model.limits", "actuation.limits")(0.8, 25.0, params.battery)
 measurement = Measurement(1.0, (3.0,) * 4, 500.0, 0.01, 0.9, discharge, charge, 0.8)
-law.step(measurement, initial_state(), settings, params, table)
+advance, Held = found("advance", "control.repeat"), found("Held", "held")
+if advance:
+    advance(measurement, Held(initial_state()), Held(initial_state()), settings, Held(params), table)
+else:
+    law.step(measurement, initial_state(), settings, params, table)
 print(law.__file__)
 """
 

@@ -27,6 +27,7 @@ from numba.core.types.containers import BaseNamedTuple, BaseTuple
 from numba.core.types.misc import unliteral
 
 from iwm_power_manager import jit, kernel_cache
+from iwm_power_manager.held_type import HeldType
 from iwm_power_manager.jit import Kernel
 from iwm_power_manager.kernel_cache import Store, UnknownSourceError
 
@@ -240,6 +241,8 @@ def described(kind: Any) -> str:
         return f"{cls.__module__}.{cls.__qualname__}({fields})"
     if isinstance(kind, BaseTuple):
         return f"({','.join(map(described, kind.types))})"
+    if isinstance(kind, HeldType):
+        return f"Held({described(kind.kind)})"
     return repr(kind)
 
 

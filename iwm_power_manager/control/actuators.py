@@ -57,7 +57,8 @@ class Evidence(NamedTuple):
     ----------
     verdict, gain : as found; gain is the part of a commanded torque that arrives, 0 for a motor that is switched off
     stuck_nm : torque that a motor has although it is switched off
-    outside_s, inside_s : how long the reports have been outside, or inside while there was a torque to judge
+    outside_s : how long the reports have been outside
+    inside_s : how long those of a weak motor have been inside while there was a torque to judge
     product, square : sums of commanded times reported and of commanded squared torque while outside, (N m)2
     least_nm, most_nm : of the reports while outside
     commanded_least_nm, commanded_most_nm : of the commands while outside
@@ -116,9 +117,8 @@ DEAD_RATIO = 0.2
 
 def commanded(state: ActuatorState, torque_nm: Wheels, dt_s: float, limits: ActuatorLimits) -> ActuatorState:
     """Remember a command that was sent, `dt_s` after the one before."""
-    aged = (Commanded(sent.age_s + dt_s, sent.torque_nm) for sent in state.recent)
-    kept = tuple(sent for sent in aged if sent.age_s <= limits.lag_s)
-    return state._replace(recent=(*kept, Commanded(0.0, torque_nm)))
+    kept = [Commanded(age_s + dt_s, sent_nm) for age_s, sent_nm in state.recent if age_s + dt_s <= limits.lag_s]
+    return ActuatorState(state.motors, (*kept, Commanded(0.0, torque_nm)), state.reporting)
 
 
 def judge(state: ActuatorState, reported_nm: Wheels, dt_s: float, limits: ActuatorLimits) -> ActuatorState:
@@ -198,6 +198,8 @@ def _switched_off(motor: Evidence, reported_nm: float, dt_s: float, limits: Actu
 
 def _inside(motor: Evidence, clear: bool, dt_s: float, limits: ActuatorLimits) -> Evidence:
     """Evidence fades at the pace at which it came: a fault that flickers is found, too, if it is there more often."""
+    if motor.verdict is MotorVerdict.GOOD and motor.outside_s == 0.0:
+        return motor
     inside_s = motor.inside_s + dt_s if clear else motor.inside_s
     outside_s = max(motor.outside_s - dt_s, 0.0)
     if outside_s == 0.0:

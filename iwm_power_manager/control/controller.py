@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from iwm_power_manager.control import law
 from iwm_power_manager.control.actuators import ActuatorLimits, ActuatorState, commanded, judge
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import InputLimits, InputMonitor
 from iwm_power_manager.control.motion import DOUBT_SPEED
 from iwm_power_manager.control.record import Watch, to_numbers
+from iwm_power_manager.control.repeat import advance
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.supervision import (
     LOCKSTEP_SUPERVISION,
@@ -30,7 +30,8 @@ from iwm_power_manager.control.supervision import (
     supervise,
 )
 from iwm_power_manager.control.table import PolicyTable
-from iwm_power_manager.control.types import Command, Measurement, Wheels, initial_state
+from iwm_power_manager.control.types import Command, ControllerState, Measurement, Wheels, initial_state
+from iwm_power_manager.held import Held
 from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.model.parameters import VehicleParams
 
@@ -89,6 +90,8 @@ class Controller:
         friction: float,
     ) -> None:
         self._vehicle = vehicle
+        self._held_vehicle = Held(vehicle)
+        self._before, self._after = Held(initial_state()), Held(initial_state())
         self._limits = limits
         self.monitor = InputMonitor(wheel_names, limits.inputs)
         self.settings = settings
@@ -103,8 +106,14 @@ class Controller:
         self.supervision = Supervision() if self._limits.age_s else LOCKSTEP_SUPERVISION
         self.actuators = ActuatorState()
         self._unreported_s = 0.0
-        self.state = initial_state()
+        self._before.value = initial_state()
+        self._assumed_friction: float | None = None
         self.command: Command | None = None
+
+    @property
+    def state(self) -> ControllerState:
+        """What the law remembers; takes longer to read than a step takes."""
+        return self._before.value
 
     @property
     def wheels_lost(self) -> int:
@@ -142,13 +151,16 @@ class Controller:
         self._follow_estimate()
         measurement = self._measurement(now_ns, dt_s)
         settings = self._settings()
-        command, after = law.step(measurement, self.state, settings, self._vehicle, self.policy)
+        command, decided, assumed = advance(
+            measurement, self._before, self._after, settings, self._held_vehicle, self.policy
+        )
         problem = violated_bound(command, self._vehicle)
         if problem:
             raise ControlFaultError(problem)
         watch = Watch(self.wheels_lost, self.monitor.demand_w, age_s)
-        values = to_numbers(measurement, settings, command, self.state, after, self.supervision, watch)
-        self.state = after
+        values = to_numbers(measurement, settings, decided, self.supervision, watch)
+        self._before, self._after = self._after, self._before
+        self._assumed_friction = assumed
         self.command = command
         self.actuators = commanded(self.actuators, command.motor_torque_nm, dt_s, self._limits.actuators)
         return Step(command, values)
@@ -157,7 +169,7 @@ class Controller:
         """The strategy assumes the friction that was estimated in the step before."""
         if self.table_of is None:
             return
-        friction = self.state.friction.assumed if self.state.steps else self.settings.friction_prior
+        friction = self.settings.friction_prior if self._assumed_friction is None else self._assumed_friction
         if friction != self.friction:
             self.friction = friction
             self.policy = self.table_of(friction)
@@ -173,7 +185,7 @@ class Controller:
     @property
     def brake_gain(self) -> Wheels:
         """Part of its friction torque that each brake seems to give."""
-        return self.state.motion.brake_gain
+        return self.command.brake_gain if self.command else (1.0, 1.0, 1.0, 1.0)
 
     def _measurement(self, now_ns: int, dt_s: float) -> Measurement:
         monitor, supervision = self.monitor, self.supervision

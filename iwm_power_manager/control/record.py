@@ -117,13 +117,11 @@ class Watch(NamedTuple):
 def to_numbers(
     measurement: Measurement,
     settings: Settings,
-    command: Command,
-    before: ControllerState,
-    after: ControllerState,
+    decided: Sequence[float],
     supervision: Supervision,
     watch: Watch,
 ) -> list[float]:
-    """Values of `SIGNALS` for one step; `before` and `after` are the law's memory."""
+    """Values of `SIGNALS` for one step; `decided` those of `DECIDED_NAMES`."""
     return [
         measurement.speed_mps,
         *measurement.wheel_speed_radps,
@@ -133,7 +131,7 @@ def to_numbers(
         *measurement.motor_stuck_nm,
         0.0 if math.isnan(measurement.acceleration_mps2) else measurement.acceleration_mps2,
         0.0 if math.isnan(measurement.acceleration_mps2) else 1.0,
-        *decided(command, before, after),
+        *decided,
         *supervision[:4],
         watch.wheels_lost,
         watch.requested_power_w,

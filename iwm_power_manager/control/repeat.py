@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many steps of the law in one call: what the law remembers stays in compiled code from step to step."""
+"""Steps of the law whose memory stays in compiled code: one at a time, for the node, and many in one call."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from iwm_power_manager.control.law import step
 from iwm_power_manager.control.record import decided, measurement_of
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.table import PolicyTable
-from iwm_power_manager.control.types import ControllerState
+from iwm_power_manager.control.types import Command, ControllerState, Measurement
+from iwm_power_manager.held import Held
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.parameters import VehicleParams
 
@@ -18,6 +19,29 @@ FloatArray = NDArray[np.float64]
 
 _decided = kernel(decided)
 _measurement = kernel(measurement_of)
+
+
+@kernel
+def advance(
+    measurement: Measurement,
+    before: Held[ControllerState],
+    after: Held[ControllerState],
+    settings: Settings,
+    vehicle: Held[VehicleParams],
+    policy: PolicyTable,
+) -> tuple[Command, tuple[float, ...], float]:
+    """One step of the law, from `before` to `after`.
+
+    Returns
+    -------
+    Command
+    values of `record.DECIDED_NAMES`
+    friction the strategy is to assume in the next step
+    """
+    command, state = step(measurement, before.value, settings, vehicle.value, policy)
+    numbers = _decided(command, before.value, state)
+    after.value = state
+    return command, numbers, state.friction.assumed
 
 
 @kernel

@@ -9,10 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iwm_power_manager.control import law
+from iwm_power_manager.control.repeat import advance
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import initial_state
+from iwm_power_manager.held import Held
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.tyre import friction_coefficient, slip_ratio
@@ -95,7 +96,7 @@ def emergency_stop(stop: Stop) -> Stopped:
     table = cases.policy_of(stop.policy).table() if stop.policy else empty_table()
     road = plant.Surroundings((stop.friction,) * 4)
     car = plant.initial_plant(params, 0.8, stop.from_mps)
-    memory = initial_state()
+    before, after, held = Held(initial_state()), Held(initial_state()), Held(params)
     slips: list[list[float]] = []
     speeds: list[float] = []
     accelerations: list[float] = []
@@ -105,7 +106,8 @@ def emergency_stop(stop: Stop) -> Stopped:
         measurement = closed_loop.measure(
             car, float(demand), stop.dt_s, stop.friction, 0.0, (0.0, 0.0, 0.0, 0.0), params
         )
-        command, memory = law.step(measurement, memory, settings, params, table)
+        command, *_ = advance(measurement, before, after, settings, held, table)
+        before, after = after, before
         slips.append(_axle_slips(car, params))
         speeds.append(car.speed_mps)
         car = plant.advance(car, command.motor_torque_nm, command.friction_torque_nm, 0.0, road, stop.dt_s, 1, params)

@@ -33,13 +33,13 @@ def jobs() -> Iterator[Job]:
     """What each program does first, in the smallest form, by name."""
     import numpy as np
 
-    from iwm_power_manager.control import law
     from iwm_power_manager.control.record import DECIDED_NAMES, SIGNALS
-    from iwm_power_manager.control.repeat import repeat
+    from iwm_power_manager.control.repeat import advance, repeat
     from iwm_power_manager.control.settings import default_settings
     from iwm_power_manager.control.thresholds import Thresholds, for_car
     from iwm_power_manager.control.types import Measurement, initial_state
     from iwm_power_manager.cycle import Cycle
+    from iwm_power_manager.held import Held
     from iwm_power_manager.mdp.demand import chain_of, cycle_source, driven_source
     from iwm_power_manager.mdp.problem import problem_from
     from iwm_power_manager.model.limits import battery_limits_w
@@ -61,7 +61,8 @@ def jobs() -> Iterator[Job]:
         for_car(Thresholds(), vehicle.params)
         discharge, charge = battery_limits_w(0.8, 25.0, vehicle.params.battery)
         measurement = Measurement(1.0, (3.0, 3.0, 3.0, 3.0), 500.0, 0.01, 0.9, discharge, charge, 0.8)
-        law.step(measurement, initial_state(), settings, vehicle.params, table)
+        before, after, car = Held(initial_state()), Held(initial_state()), Held(vehicle.params)
+        advance(measurement, before, after, settings, car, table)
         steps = np.zeros((0, len(SIGNALS)))
         repeat(steps, initial_state(), settings, vehicle.params, table, np.zeros((0, len(DECIDED_NAMES))))
 

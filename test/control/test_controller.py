@@ -381,18 +381,18 @@ class TestFaultOfTheLaw:
         drive.run(60)
         good = drive.controller.command
 
-        real = law.step
+        real = module.advance
 
         def broken(*arguments: Any) -> Any:
-            command, after = real(*arguments)
-            return command._replace(motor_torque_nm=(torque, 0.0, 0.0, 0.0)), after
+            command, *rest = real(*arguments)
+            return command._replace(motor_torque_nm=(torque, 0.0, 0.0, 0.0)), *rest
 
-        monkeypatch.setattr(module.law, "step", broken)
+        monkeypatch.setattr(module, "advance", broken)
         state = drive.controller.state
         with pytest.raises(ControlFaultError, match="wheel 0"):
             drive.controller.step(drive.now_ns, DT)
         assert drive.controller.command is good
-        assert drive.controller.state is state
+        assert drive.controller.state == state
 
 
 # What a broken network, a broken sensor or a broken program may send.

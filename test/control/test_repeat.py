@@ -7,10 +7,11 @@ import numpy as np
 
 from iwm_power_manager.control import law
 from iwm_power_manager.control.record import DECIDED_NAMES, SIGNALS, decided, measurement_of
-from iwm_power_manager.control.repeat import repeat
+from iwm_power_manager.control.repeat import advance, repeat
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import initial_state
+from iwm_power_manager.held import Held
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 
@@ -45,6 +46,22 @@ def test_steps_in_one_call_are_those_one_by_one() -> None:
         state = after
     assert end == state
     assert np.ptp(results[:, :8], axis=0).min() > 1.0
+
+
+def test_a_step_between_held_memories_is_the_same() -> None:
+    numbers = drive()
+    settings = default_settings("instantaneous_slip")
+    state = initial_state()
+    before, after, car = Held(state), Held(state), Held(VEHICLE)
+    for row in numbers[:60].tolist():
+        measurement = measurement_of(row)
+        command, state = law.step(measurement, before.value, settings, VEHICLE, empty_table())
+        found, values, friction = advance(measurement, before, after, settings, car, empty_table())
+        assert found == command
+        assert after.value == state
+        assert values == decided(command, before.value, state)
+        assert friction == state.friction.assumed
+        before, after = after, before
 
 
 def test_cut_in_blocks_it_is_the_same() -> None:

@@ -65,16 +65,18 @@ class Pair:
 @pytest.fixture(scope="session")
 def compiled_law() -> None:
     """Compile the law once, before processes are started that have to answer in time."""
-    from iwm_power_manager.control import law
+    from iwm_power_manager.control.repeat import advance
     from iwm_power_manager.control.settings import default_settings
     from iwm_power_manager.control.table import empty_table
     from iwm_power_manager.control.types import Measurement, initial_state
+    from iwm_power_manager.held import Held
     from iwm_power_manager.share import resolve
     from iwm_power_manager.vehicle import load_vehicle
 
-    vehicle = load_vehicle(resolve("config/vehicles/jalalmaab_2015.yaml")).params
+    vehicle = Held(load_vehicle(resolve("config/vehicles/jalalmaab_2015.yaml")).params)
+    before, after = Held(initial_state()), Held(initial_state())
     measurement = Measurement(1.0, (3.0, 3.0, 3.0, 3.0), 1.0, 0.01, 0.9, 1.0, 1.0, 0.5)
-    law.step(measurement, initial_state(), default_settings("equal"), vehicle, empty_table())
+    advance(measurement, before, after, default_settings("equal"), vehicle, empty_table())
 
 
 def _pairs(folders: pytest.TempPathFactory) -> Iterator[Callable[..., Pair]]:

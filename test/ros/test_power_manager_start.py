@@ -117,7 +117,7 @@ def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, monkeypatch) -> None
         time.sleep(0.01)
     assert running.stop(signal.SIGINT) == 0
     assert "Traceback" not in running.text()
-    assert not any(cache.rglob("*.law.step-*")), "it went on compiling"
+    assert not any(cache.rglob("*.repeat.advance-*")), "it went on compiling"
 
 
 def test_services_are_answered_while_it_compiles(tmp_path, monkeypatch) -> None:
@@ -127,7 +127,7 @@ def test_services_are_answered_while_it_compiles(tmp_path, monkeypatch) -> None:
     try:
         assert bench.lifecycle_state() == "unconfigured"
         assert bench.get_parameter("rate_hz") == 100.0
-        assert not any((tmp_path / "cache").rglob("*.law.step-*")), "it has compiled already"
+        assert not any((tmp_path / "cache").rglob("*.repeat.advance-*")), "it has compiled already"
     finally:
         running.process.kill()
         running.wait()

@@ -71,4 +71,4 @@ def test_it_lists_what_it_compiled(capsys) -> None:
 
     assert precompile.main(["--quiet", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)
-    assert "iwm_power_manager.control.law.step" in {use["kernel"] for use in listed}
+    assert "iwm_power_manager.control.repeat.advance" in {use["kernel"] for use in listed}
