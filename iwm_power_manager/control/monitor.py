@@ -41,6 +41,10 @@ _MOST_MPS2 = 30.0
 _ACCELERATION_OLDEST_S = 0.1
 #: Refused for what was accepted before, not for what they are.
 _REFUSED_BY_ANOTHER = (Violation.TOO_FAST, Violation.STAMP_NOT_NEWER)
+#: Refused for its values.
+_OF_VALUES = (Violation.OUT_OF_RANGE, Violation.NOT_FINITE, Violation.AXLE_LOST, Violation.LENGTH)
+#: No message is that long on its way; a stamp of 0 is that old.
+_OTHER_CLOCK_S, _UNSTAMPED_S = 1.0, 1e9
 #: Speeds that agree differ by no more than this, and this part of the largest.
 _SAME_MPS, _SAME = 0.5, 0.1
 #: The battery comes a tenth as often as the other inputs.
@@ -126,7 +130,8 @@ class Tally:
     dropped : by reason
     accepted_ns : time of the last accepted one: its stamp, or when it was received if it has none (None: none yet)
     violation : why the last message was dropped, or was accepted with a reservation
-    describe : says more of a message that was out of range or not finite, "" for nothing
+    describe : says more of a message whose values were refused, "" for nothing
+    stamp_off_s : how far the last stamp that was judged lay from the clock
     """
 
     received: int = 0
@@ -134,17 +139,24 @@ class Tally:
     accepted_ns: int | None = None
     violation: Violation = Violation.NONE
     describe: Callable[[], str] = str
+    stamp_off_s: float = 0.0
 
     def why(self) -> str:
         """What was wrong with the last message, in words; "" if nothing was."""
         if self.violation is Violation.NONE:
             return ""
         more = self.described()
+        if self.violation in (Violation.STAMP_TOO_OLD, Violation.STAMP_IN_FUTURE) and self.stamp_off_s:
+            more = f"by {self.stamp_off_s:.3g} s"
+            if self.stamp_off_s > _UNSTAMPED_S:
+                more += ", no stamp? then stamp: source; simulated time? then use_sim_time for both"
+            elif self.stamp_off_s > _OTHER_CLOCK_S:
+                more += ", another clock? then stamp: source"
         return self.violation.name.lower().replace("_", " ") + (f": {more}" if more else "")
 
     def described(self) -> str:
-        """What there is to say of the last message, where it was out of range or not finite."""
-        return self.describe() if self.violation in (Violation.OUT_OF_RANGE, Violation.NOT_FINITE) else ""
+        """What there is to say of the last message, where its values were refused."""
+        return self.describe() if self.violation in _OF_VALUES else ""
 
     def age_s(self, now_ns: int) -> float:
         """Time since the last accepted message; infinite before the first."""
@@ -179,6 +191,8 @@ class InputMonitor:
         self._wheel_names = wheel_names
         self._limits = limits
         self.tallies = {topic: Tally() for topic in (SPEED, WHEELS, DEMAND, BATTERY, FRICTION)}
+        self.tallies[WHEELS].describe = self._why_no_wheels
+        self._last_wheels = JointReading(0, (), ())
         self.wheels_refused: Counter[tuple[str, WheelVerdict]] = Counter()
         self.forget()
 
@@ -255,6 +269,7 @@ class InputMonitor:
         A message that lacks a wheel is counted and reported, and still used for the others.
         """
         tally = self.tallies[WHEELS]
+        self._last_wheels = reading
         violation = self._check_stamp(tally, reading.stamp_ns, now_ns)
         if violation is Violation.NONE:
             violation = check_names(reading.names, len(reading.values), self._wheel_names)
@@ -349,6 +364,15 @@ class InputMonitor:
             return True
         return False
 
+    def _why_no_wheels(self) -> str:
+        _, names, values = self._last_wheels
+        if len(names) != len(values):
+            return f"{len(values)} values for {len(names)} wheels"
+        lost = [(n, v) for n, v in zip(self._wheel_names, self.verdicts, strict=True) if v is not WheelVerdict.GOOD]
+        words = ", ".join(f"{name} {verdict.name.lower().replace('_', ' ')}" for name, verdict in lost)
+        absent = set(self._wheel_names).difference(names)
+        return words + (f"; the message names {', '.join(map(repr, names[:8])) or 'nothing'}" if absent else "")
+
     def _outlasts(self, topic: str, stamp_ns: int, value: float, limits: ValueLimits, rival_s: float) -> bool:
         """Whether a refused message is of a second source that has agreed with itself for long, beside a live first.
 
@@ -376,4 +400,5 @@ class InputMonitor:
     def _check_stamp(self, tally: Tally, stamp_ns: int, now_ns: int) -> Violation:
         if self._limits.stamp is None:
             return Violation.NONE
+        tally.stamp_off_s = abs(stamp_ns - now_ns) / _NS_PER_S
         return check_stamp(stamp_ns, tally.accepted_ns, now_ns, self._limits.stamp)

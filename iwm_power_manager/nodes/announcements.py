@@ -203,7 +203,7 @@ class Announcements:
             reason = "; ".join(dict.fromkeys(trouble[topic] for topic in silent if topic in trouble))
             if not reason and tally.why():
                 reason = f"{tally.dropped[tally.violation]} messages refused, {tally.why()}"
-                found = () if tally.described() else found  # which says on what topic
+                found = () if name == DEMAND and tally.described() else found  # which says on what topic
             elif not reason and tally.received:
                 age_s = tally.age_s(now_ns)
                 reason = "none since it started over" if math.isinf(age_s) else f"none for {age_s:.2f} s"

@@ -31,7 +31,7 @@ class Neighbours(NamedTuple):
 def look(node: Node, inputs: Inputs, outputs: Outputs, slow: dict[str, str]) -> Neighbours:
     """Look at the graph as it is now; `slow` tells of topics that are heard, but not as often as they should be."""
     types = inputs.types | outputs.types
-    commanders = {topic: node.count_publishers(topic) for topic in outputs.topics}
+    commanders = {topic: node.count_publishers(topic) for topic in map(node.resolve_topic_name, outputs.topics)}
     deaf = _lines(mismatched_subscribers(node, outputs.publishers, types))
     wrong = [*_shared(commanders), *deaf]
     values = {f"{topic}: publishers": str(count) for topic, count in commanders.items()}

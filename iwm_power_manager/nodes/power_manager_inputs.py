@@ -112,9 +112,6 @@ class Inputs:
     def drop_all(self) -> None:
         """Forget what has arrived."""
         self._intake.drop_all()
-
-    def forget_rates(self) -> None:
-        """Measure them anew: this node was not there all the time."""
         for sent_ns in self._sent_ns.values():
             sent_ns.clear()
 

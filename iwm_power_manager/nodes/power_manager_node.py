@@ -36,7 +36,7 @@ from iwm_power_manager.nodes.starting import Starting
 from iwm_power_manager.ros import diagnostics, messages, realtime
 from iwm_power_manager.ros.parameters import ParameterError, check_change, declare
 from iwm_power_manager.signals.commands import FRICTION
-from iwm_power_manager.signals.contract import NODE_FRICTION, NODE_STATE
+from iwm_power_manager.signals.contract import CLOCK, NODE_FRICTION, NODE_STATE
 
 #: How often, and how far apart, the rest of a set is looked for once its demand is there; later the watchdog looks.
 _SET_PATIENCE = 20
@@ -246,8 +246,6 @@ class PowerManager(Starting):
         if self._demand_log:
             self._demand_log.pause()
         self._answer = None
-        if self._inputs is not None:
-            self._inputs.forget_rates()
 
     # Lock-step
 
@@ -330,7 +328,7 @@ class PowerManager(Starting):
             self._demand_log.note(taken.stamp_ns, taken.step.values)
         elapsed_s = time.perf_counter() - started_s
         asked_w = self._controller.monitor.demand_w
-        self._report.note_step(taken.step.command, supervision.motor_factor, asked_w, taken.since_s, elapsed_s)
+        self._report.note_step(taken.step.command, supervision, asked_w, taken.since_s, elapsed_s)
 
     # Parameters
 
@@ -402,8 +400,10 @@ class PowerManager(Starting):
                 if not self.get_clock().ros_time_is_active:
                     self._says.started_over(HELD_UP)
                     self._fault = "no control step: this process was held up, or the system's clock was set back"
-                elif self._fault != _STANDS_STILL:
-                    self._fault = _STANDS_STILL
+                elif not self._fault.startswith(_STANDS_STILL):
+                    clock, self._fault = self.resolve_topic_name(CLOCK), _STANDS_STILL
+                    if not self.count_publishers(clock):
+                        self._fault += f" (use_sim_time is true, {clock} has no publisher)"
                     self.get_logger().warning(f"{self._fault}: zero torque")
                 self._start_over()
                 assert self._outputs is not None
@@ -412,7 +412,8 @@ class PowerManager(Starting):
                 self._fault = ""
             self._says.pedals(self._remarks())
             heard_ns = self._inputs.heard_ns if self._inputs else {}
-            self._says.stepped(controller, self._topics, self._unheard, self._wheel_names, self._now_ns(), heard_ns)
+            if not self._fault.startswith(_STANDS_STILL):  # until it goes on nobody looks for messages
+                self._says.stepped(controller, self._topics, self._unheard, self._wheel_names, self._now_ns(), heard_ns)
         shown = controller and (
             controller.supervision.mode,
             controller.supervision.stale,

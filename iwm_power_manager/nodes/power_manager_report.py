@@ -11,7 +11,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 
 from iwm_power_manager.control.controller import Controller
-from iwm_power_manager.control.supervision import Supervision, binding_limits
+from iwm_power_manager.control.motion import DOUBT_SPEED
+from iwm_power_manager.control.supervision import STALE_SPEED, STALE_WHEELS, Supervision, binding_limits
 from iwm_power_manager.control.types import GATE_NONE, LIMIT_BATTERY_DISCHARGE, LIMIT_SLEW, Command
 from iwm_power_manager.ros import diagnostics
 
@@ -73,17 +74,20 @@ class PowerManagerReport:
         self.doubts: list[str] = []
 
     def note_step(
-        self, command: Command, motor_factor: float, asked_w: float, period_s: float | None, execution_s: float
+        self, command: Command, supervision: Supervision, asked_w: float, period_s: float | None, execution_s: float
     ) -> None:
-        """Count one step of the active node."""
+        """Count one step of the active node; what did not come is missing, and not doubted."""
+        missing = DOUBT_SPEED * bool(supervision.stale & STALE_SPEED)
+        missing |= (DOUBT_SPEED - 1) * bool(supervision.stale & STALE_WHEELS)
+        doubted = command.doubted & ~missing
         self._loop.add(period_s, execution_s)
         self._steps += 1
-        self._cut_steps += is_cut(command, motor_factor, asked_w)
-        self._doubted.update(number for number in range(5) if command.doubted & 1 << number)
+        self._cut_steps += is_cut(command, supervision.motor_factor, asked_w)
+        self._doubted.update(number for number in range(5) if doubted & 1 << number)
         if command.gate != GATE_NONE:
             self._activity["gate"] += 1
         if command.limits:
-            self._activity.update(binding_limits(command.limits, motor_factor))
+            self._activity.update(binding_limits(command.limits, supervision.motor_factor))
 
     def message(
         self,

@@ -32,7 +32,15 @@ COMMANDS = {"wheel_torque_command": JOINTS, "friction_brake_command": JOINTS}
 class Connected:
     """A power manager told by a signals file of the stack beside it."""
 
-    def __init__(self, folder: Path, name: str, text: str | Path, stack: Stack, parameters: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        name: str,
+        text: str | Path,
+        stack: Stack,
+        parameters: dict[str, Any],
+        more_remaps: dict[str, str],
+    ) -> None:
         path = text if isinstance(text, Path) else folder / "signals.yaml"
         if isinstance(text, str):
             path.write_text(text)
@@ -40,6 +48,7 @@ class Connected:
         remaps = {"__ns": name, "/diagnostics": f"{name}/diagnostics"}
         remaps |= {topic: name + topic for topic in ("/odom", "/joint_states", "/pedals/accelerator", "/pedals/brake")}
         remaps |= {topic: name + topic for topic in ("/battery/charge", "/battery/temperature")}
+        remaps |= {topic: name + other for topic, other in more_remaps.items()}
         self.stack = stack
         self.running = Running(MODULE, arguments(given, remaps), DOMAIN, folder)
 
@@ -53,11 +62,12 @@ def connect(tmp_path: Path, compiled_law: None, request: pytest.FixtureRequest) 
         sends: dict[str, str],
         hears: dict[str, str] | None = None,
         reliability: str = "best_effort",
+        remaps: dict[str, str] | None = None,
         **parameters: Any,
     ) -> Connected:
         name = f"/stack_{os.getpid()}_{abs(hash(request.node.name)) % 10**6}_{len(made)}"
         stack = Stack(DOMAIN, name, sends, COMMANDS if hears is None else hears, reliability)
-        made.append(Connected(tmp_path, name, text, stack, parameters))
+        made.append(Connected(tmp_path, name, text, stack, parameters, remaps or {}))
         return made[-1]
 
     yield start
@@ -177,6 +187,25 @@ def test_wheels_on_topics_of_their_own_are_counted_however_slow_the_loop_is(conn
     car.stack.drive(inputs, lambda: len(states) > before + 80, "four more seconds", 0.25)
     wheels = [line for line in slow() if "wheel_states" in line]
     assert len(wheels) <= 1, "one line for the four of them"
+
+
+def test_topics_remapped_on_the_command_line_are_the_ones_that_are_watched(connect: Callable[..., Connected]) -> None:
+    """A speed and a command that are remapped, and somebody else who commands there."""
+    sends = {"ecu/speed": TWIST, "wanted": ACCEL, "charge": NUMBER, "ecu/torque": NUMBER}
+    sends |= {f"rpm_{i}": NUMBER for i in range(4)}
+    remaps = {"speed_kmh": "/ecu/speed", "torque_0": "/ecu/torque"}
+    car = connect(FOUR_TOPICS, sends, {"ecu/torque": NUMBER}, remaps=remaps)
+
+    def inputs(stack: Stack) -> dict[str, Any]:
+        wanted = of_type(ACCEL, header__stamp=stack.stamp(), accel__linear__x=1.0)
+        wheels = {f"rpm_{i}": number(0.0) for i in range(4)}
+        return {"ecu/speed": of_type(TWIST), "wanted": wanted, "charge": number(80.0), **wheels}
+
+    car.stack.drive(inputs, lambda: car.stack.last("ecu/torque") and car.stack.last("ecu/torque").data > 50.0, "torque")
+    name = car.stack.node.get_namespace()
+    said = f"{name}/ecu/torque has 2 publishers"
+    car.stack.drive(inputs, lambda: said in car.running.text(), "the other commander")
+    assert f"{name}/ecu/torque: publishers: 2" in values(car.stack, "command topics")
 
 
 def test_pedals_of_another_unit_are_told(connect: Callable[..., Connected]) -> None:

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from iwm_power_manager.control.actuators import ActuatorState, Evidence, MotorVerdict
 from iwm_power_manager.control.inputs import Violation, WheelVerdict
 from iwm_power_manager.control.monitor import Tally
+from iwm_power_manager.control.motion import DOUBT_SPEED
 from iwm_power_manager.control.record import DECIDED_NAMES, command_of
 from iwm_power_manager.control.supervision import (
     MODE_DEGRADED,
@@ -16,9 +19,10 @@ from iwm_power_manager.control.supervision import (
     MODE_RECOVERING,
     STALE_DEMAND,
     STALE_SPEED,
+    STALE_WHEELS,
     Supervision,
 )
-from iwm_power_manager.nodes.power_manager_report import ChangeDetector, is_cut
+from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport, is_cut
 from iwm_power_manager.ros.diagnostics import (
     ERROR,
     OK,
@@ -227,3 +231,23 @@ def test_a_brake_that_gives_less_than_it_is_told_is_named():
 def test_only_driving_asked_for_in_earnest_and_with_all_inputs_there_counts_as_cut(given_w, motor_factor, asked_w, cut):
     command = command_of((0.0,) * len(DECIDED_NAMES))._replace(front_power_w=0.5 * given_w, rear_power_w=0.5 * given_w)
     assert is_cut(command, motor_factor, asked_w) is cut
+
+
+@pytest.mark.parametrize(
+    ("stale", "named"),
+    [(0, "wheel fl, vehicle_speed"), (STALE_SPEED, "wheel fl"), (STALE_WHEELS, "vehicle_speed"), (3, "")],
+)
+def test_an_input_that_does_not_come_is_missing_and_not_doubted(stale, named):
+    report = PowerManagerReport("/pm", ("fl", "fr", "rl", "rr"), None, {})
+    command = command_of((0.0,) * len(DECIDED_NAMES))._replace(doubted=1 | DOUBT_SPEED)
+    controller = SimpleNamespace(
+        supervision=Supervision(stale=stale),
+        command=command,
+        monitor=SimpleNamespace(tallies={}, verdicts=(WheelVerdict.GOOD,) * 4, agree=False),
+        actuators=ActuatorState(),
+        brake_gain=(1.0,) * 4,
+    )
+    for _ in range(5):
+        report.note_step(command, controller.supervision, 0.0, 0.01, 1e-4)
+    report.message(0, "active", controller, LIMITS | {"strategy": "equal"}, [])
+    assert [line.partition(" not believed")[0] for line in report.doubts] == ([named] if named else [])

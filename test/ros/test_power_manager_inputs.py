@@ -323,6 +323,15 @@ def test_a_wheel_that_never_comes_is_named_while_the_others_drive(start_own) -> 
     assert "wheel rear_right" not in pair.running.text()
 
 
+def test_wheels_of_other_names_are_told_with_the_names_that_came(start_own) -> None:
+    pair = start_own()
+    pair.bench.connect()
+    said = r"waits for .*axle lost: front_left absent, .*; the message names 'fl', 'fr', 'rl', 'rr'\)"
+    log = pair.running.text
+    pair.bench.drive(lambda: re.search(said, log()), "the names", names=("fl", "fr", "rl", "rr"))
+    pair.bench.drive(lambda: "length: 3 values for 4 wheels" in log(), "the shape", wheels=(1.0, 1.0, 1.0))
+
+
 class TestParameters:
     @pytest.mark.parametrize(
         ("name", "value"),

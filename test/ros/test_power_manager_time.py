@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import random
+import time
 from pathlib import Path
 
 import pytest
@@ -133,6 +134,18 @@ class TestLockstep:
             expected.append(dict(zip(SIGNAL_NAMES, map(float, numbers), strict=True)))
         bench.spin_until(lambda: len(bench.states) == 150, "all states")
         assert bench.states == expected
+
+
+def test_simulated_time_that_nobody_tells_is_named_and_no_input_is_blamed(start_own) -> None:
+    pair = start_own(sim_time=True)
+    bench = pair.bench
+    bench.node.destroy_publisher(bench.publishers.pop(messages.CLOCK))
+    clock = f"{bench.node.get_namespace()}/clock"
+    said = f"the clock stands still (use_sim_time is true, {clock} has no publisher): zero torque"
+    bench.spin_until(lambda: bench.send() and said in pair.running.text(), "the reason")
+    until_s = time.monotonic() + 2.0
+    bench.spin_until(lambda: bench.send() and time.monotonic() > until_s, "time for more words")
+    assert "waits for" not in pair.running.text()
 
 
 def single(message):
