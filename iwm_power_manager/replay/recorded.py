@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iwm_power_manager.bags.reader import BagReader, Message
+from iwm_power_manager.control.inputs import ValueLimits, Violation, check_value
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
+from iwm_power_manager.control.thresholds import RECORDED, input_limits
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.mdp.demand import Source, signal_source
 from iwm_power_manager.mdp.problem import Problem
@@ -66,8 +68,8 @@ class RecordedDrive(NamedTuple):
     time_s : strictly increasing, from 0
     power_demand_w : at the wheels, braking negative
     speed_mps : the speed known at that time
-    bad_messages : messages that could not be decoded or held no finite number
-    damage : what could not be read of the bag, a line each
+    bad_messages : messages that could not be decoded or held no number that a car may have
+    damage : what could not be read of the bag, or not used, a line each
     """
 
     time_s: FloatArray
@@ -256,24 +258,32 @@ def read_signal(
     """
     mapping = mapping or load_mapping()
     rows: list[tuple[int, int, float, float]] = []  # log time, stamp of the speed, demand, speed
-    speed, stamp = math.nan, -1
+    speed, stamp, wrong = math.nan, -1, 0
+    believed = input_limits(RECORDED, 1.0, by_clock=False)
     with BagReader(bag) as reader:
         stream = SignalStream(reader, mapping, vehicle, ("speed", *DEMANDS, *PEDALS))
         check_signals(reader, mapping, stream)
+        standing = stream.use_log_times(stream.probe())
         for log_time_ns, _, stamped, reading in stream:
-            if isinstance(reading, SpeedReading):
+            if isinstance(reading, SpeedReading) and _possible(reading.speed_mps, believed.speed):
                 speed = reading.speed_mps
                 stamp = reading.stamp_ns if stamped else -1
-            elif isinstance(reading, readings.DemandReading) and not math.isnan(speed):
-                rows.append((log_time_ns, stamp, reading.power_w, speed))
-        damage = [*reader.damage, *stream.problems]
+            elif isinstance(reading, readings.DemandReading) and _possible(reading.power_w, believed.demand):
+                rows += [] if math.isnan(speed) else [(log_time_ns, stamp, reading.power_w, speed)]
+            else:
+                wrong += isinstance(reading, SpeedReading | readings.DemandReading)
+        damage = [*reader.damage, *stream.problems, *filter(None, [standing])]
     if not rows:
         raise BagError(f"{bag}: holds no power demand with a speed before it")
     log_times, stamps, demands, speeds = map(np.array, zip(*rows, strict=True))
     time_ns = _times(log_times, stamps)
     keep = _advancing(time_ns)
     time_s = (time_ns[keep] - time_ns[keep[0]]) * 1e-9
-    return RecordedDrive(time_s, demands[keep], speeds[keep], stream.bad_messages, damage)
+    return RecordedDrive(time_s, demands[keep], speeds[keep], stream.bad_messages + wrong, damage)
+
+
+def _possible(value: float, limits: ValueLimits) -> bool:
+    return check_value(value, math.nan, 0.0, limits) is Violation.NONE
 
 
 def read_drives(

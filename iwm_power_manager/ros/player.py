@@ -35,6 +35,8 @@ from iwm_power_manager.signals.mapping import topic_named
 _NOT_PLAYED = ("/diagnostics", "/rosout", "/parameter_events", CLOCK)
 
 _TICK_NS = 10_000_000
+#: No drive pauses for longer, ns: a clock that jumps by more was set.
+_LONGEST_PAUSE_NS = 3600 * 10**9
 _NS_PER_S = 1_000_000_000
 _DEPTH = 1000
 #: Before the first message: until the listeners have stayed the same for the one, at most for the other.
@@ -226,20 +228,22 @@ def _publisher(node: Node, bag: BagReader, name: str) -> Any:
 
 
 def paced(bag: BagReader, jumps: list[str]) -> Iterator[tuple[int, int, Message]]:
-    """The bag's messages with the time since the first, in which no clock goes back, and the time of each.
+    """The bag's messages with the time since the first, in which no clock jumps, and the time of each.
 
-    A line for each time the recorded clock jumps back is added to `jumps`.
+    A line for each time the recorded clock jumps, back or by more than any pause, is added to `jumps`.
     """
     last_ns: int | None = None
     offset_ns = 0
     for time_ns, message in _timeline(bag):
-        if last_ns is not None and time_ns < last_ns:
+        step_ns = 0 if last_ns is None else time_ns - last_ns
+        if 0 <= step_ns <= _LONGEST_PAUSE_NS:
+            offset_ns += step_ns
+        else:
+            way = "back" if step_ns < 0 else "forward"
             jumps.append(
-                f"the recorded clock jumps back by {(last_ns - time_ns) / _NS_PER_S:.3f} s after "
+                f"the recorded clock jumps {way} by {abs(step_ns) / _NS_PER_S:.3f} s after "
                 f"{offset_ns / _NS_PER_S:.3f} s: played on at its own pace"
             )
-        elif last_ns is not None:
-            offset_ns += time_ns - last_ns
         last_ns = time_ns
         yield offset_ns, time_ns, message
 

@@ -80,6 +80,34 @@ def test_a_type_that_changed_between_two_drives_is_read_as_each_bag_has_it(tmp_p
     assert all(found.speed_mps.max() == pytest.approx(9.5, abs=0.01) for found in drives)
 
 
+@pytest.mark.parametrize(
+    ("stamp", "said"),
+    [
+        (lambda log_ns: (2**31 - 1) * 10**9 if log_ns == foreign.START_NS + 10 * foreign.PERIOD_NS else log_ns, 1),
+        (lambda log_ns: (log_ns - foreign.START_NS) // 10**9, 1),
+        (lambda log_ns: log_ns, 0),
+    ],
+    ids=["one far off", "seconds for nanoseconds", "as it should be"],
+)
+def test_a_drive_is_learned_from_at_log_times_where_its_stamps_do_not_advance(
+    tmp_path: Path, mapping: Path, stamp: Callable[[int], int], said: int
+) -> None:
+    found = read_signal(write_bag(tmp_path / "bag", drive(stamp=stamp)), load_mapping(mapping))
+    assert found.time_s[-1] == pytest.approx((COUNT - 1) * foreign.PERIOD_NS * 1e-9, abs=1e-4)
+    assert len(found.time_s) == COUNT
+    assert [line for line in found.damage if "do not advance: log times are used" in line] == found.damage
+    assert len(found.damage) == said
+
+
+def test_what_no_car_has_is_not_learned_from(tmp_path: Path, mapping: Path) -> None:
+    wrong = {0: struct.pack("<d", 900.0), 1: struct.pack("<d", 1e12)}
+    entries = [(t, n, data[:-8] + wrong[n] if n < 2 and i % 30 < 2 else data) for i, (t, n, data) in enumerate(drive())]
+    found = read_signal(write_bag(tmp_path / "bag", entries), load_mapping(mapping))
+    assert found.bad_messages == 2 * len(range(0, COUNT, 10))
+    assert found.power_demand_w.tolist() == [3000.0] * (COUNT - COUNT // 10)
+    assert found.speed_mps.max() < 9.6
+
+
 def test_a_missing_nested_definition_is_one_line_with_topic_and_type(
     tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -221,15 +221,22 @@ def clocked(path: Path, clock_ns: Callable[[int], int], *more: foreign.Channel) 
     return foreign.write_bag(path, sorted(entries), [*foreign.CHANNELS, clock, *more])
 
 
-def test_a_clock_that_jumps_back_is_played_on_at_its_own_pace_and_said(tmp_path: Path) -> None:
-    bag = clocked(tmp_path / "bag", lambda i: (50 + i % 5) * foreign.PERIOD_NS)
+@pytest.mark.parametrize(
+    ("shown", "jump"),
+    [(lambda i: 50 + i % 5, "back by 0.080 s"), (lambda i: 50 + i + (i > 4) * 10**9, "forward by 20000000.020 s")],
+    ids=["back", "forward"],
+)
+def test_a_clock_that_jumps_is_played_on_at_its_own_pace_and_said(
+    tmp_path: Path, shown: Callable[[int], int], jump: str
+) -> None:
+    bag = clocked(tmp_path / "bag", lambda i: shown(i) * foreign.PERIOD_NS)
     jumps: list[str] = []
     with BagReader(bag) as reader:
         found = [(offset, time) for offset, time, message in paced(reader, jumps) if message.topic == "/demand"]
     pace = [0, 1, 2, 3, 4, 4, 5, 6, 7, 8]  # the time between the two drives is not known
     assert [offset for offset, _ in found] == [i * foreign.PERIOD_NS for i in pace]
-    assert [time for _, time in found] == [(50 + i % 5) * foreign.PERIOD_NS for i in range(10)]
-    assert jumps == ["the recorded clock jumps back by 0.080 s after 0.080 s: played on at its own pace"]
+    assert [time for _, time in found] == [shown(i) * foreign.PERIOD_NS for i in range(10)]
+    assert jumps == [f"the recorded clock jumps {jump} after 0.080 s: played on at its own pace"]
 
 
 def test_a_topic_whose_type_is_not_installed_is_left_out_with_one_line_and_the_rest_is_played(
