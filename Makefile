@@ -14,7 +14,7 @@ export ROS_LOG_DIR ?= $(CURDIR)/log/ros
 
 ##@ The two commands
 .PHONY: demo test
-demo: setup-run  ## Drive the New York City Cycle over DDS, record it, show the result (2 min)
+demo: setup-run  ## Drive the New York City Cycle over DDS, record it, show the result (2 min; the first time also set-up, 3 min)
 	@$(BIN)/demo $(ARGS)
 
 test: lint type  ## Linters, types and all tests (20 min)
