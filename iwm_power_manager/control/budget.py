@@ -6,20 +6,20 @@ one; one by a quarter of the power or more counts as one, a smaller one in propo
 The price of a change goes by the mean of the three. What is budgeted is the second: it is never less than the number of
 changes by more than a quarter, and swinging just around that is no way out.
 
-Every change fills a bucket that leaks at the rate of the budget. A share whose change does not fit, or from which the
-way back to the middle would not fit, is not offered: so no minute sees more than the budget and one bucket, no hour
-more than sixty budgets and one bucket, whatever is driven, and nothing can hold the split at a share that has become
-wrong.
+Every change fills two buckets. One holds five minutes' budget and leaks at the rate of the budget: it leaves a busy
+stretch of a drive what quiet ones did not use. The other holds little more than one minute's and leaks twice as fast:
+it keeps a single minute bearable. A share whose change does not fit into both, or from which the way back to the
+middle would not fit, is not offered: so no minute sees more than the budget and `burst`, no hour more than sixty
+budgets and the first bucket, whatever is driven, and nothing can hold the split at a share that has become wrong.
 
 The price of a change is the multiplier of the constrained problem. A constant one is optimal: it is the solver's, while
-the bucket is empty. It rises with what is used, as an integral controller of the multiplier: in proportion to the level
-in the logarithm, to `DEAREST` times at a full bucket, where no change pays (docs/solver.md derives the rate and what it
-costs).
+the buckets are empty, and little more until one of them is nearly full (docs/solver.md).
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from iwm_power_manager.jit import kernel
 
@@ -27,11 +27,18 @@ from iwm_power_manager.jit import kernel
 WHOLE_CHANGE = 0.25
 #: Prices of a change at which the solver tabulates the cost-to-go beside its own, as multiples of it.
 DEARER = (3.0, 9.0)
-#: At a full bucket a change costs this many times the solver's price.
-DEAREST = 20.0
 
-#: The bucket holds this many minutes' budget; at least one change and the way back.
-BUCKET_MIN = 2.0
+#: The first bucket holds this many minutes' budget; both hold at least one change and the way back.
+LASTING_MIN = 5.0
+#: The second one holds this many, and leaks at this many times the budget.
+MINUTE_MIN, MINUTE_LEAK = 1.25, 2.0
+_LEAST = 2.0
+
+#: What a price that is higher by one in the logarithm takes from the changes, as a part of the budget.
+ELASTICITY = 0.35
+#: Price at a full first bucket beside what its end asks for, and at a full second one, which is free to its half.
+BUSY, HURRIED = 2.0, math.exp(2.0)
+_FULL = 0.99
 _ROUNDING = 1e-9
 
 
@@ -49,33 +56,60 @@ def price_units(move: float) -> float:
     return (1.0 + changes_counted(move) + abs(move)) / 3.0
 
 
-@kernel
-def bucket(changes_per_min: float) -> float:
-    """Changes the bucket holds."""
-    return max(BUCKET_MIN * changes_per_min, 2.0)
+class Used(NamedTuple):
+    """Changes that still count as used, in each bucket."""
+
+    lasting: float
+    minute: float
 
 
 @kernel
-def leaked(used: float, seconds: float, changes_per_min: float) -> float:
-    """Changes still counted as used after a time."""
-    return max(used - changes_per_min / 60.0 * seconds, 0.0)
+def buckets(changes_per_min: float) -> Used:
+    """Changes the buckets hold."""
+    return Used(max(LASTING_MIN * changes_per_min, _LEAST), max(MINUTE_MIN * changes_per_min, _LEAST))
 
 
 @kernel
-def affordable(share: float, previous: float, used: float, changes_per_min: float) -> bool:
-    """Whether the bucket has room for a new share, and for the way back to the middle. Without a budget it has."""
+def burst(changes_per_min: float) -> float:
+    """Changes that any minute may have beyond the budget."""
+    size = buckets(changes_per_min)
+    return min(size.lasting, size.minute + (MINUTE_LEAK - 1.0) * changes_per_min)
+
+
+@kernel
+def leaked(used: Used, seconds: float, changes_per_min: float) -> Used:
+    """What still counts as used after a time."""
+    leak = changes_per_min / 60.0 * seconds
+    return Used(max(used.lasting - leak, 0.0), max(used.minute - MINUTE_LEAK * leak, 0.0))
+
+
+@kernel
+def spent(used: Used, move: float) -> Used:
+    """What counts as used after a move of the share."""
+    count = changes_counted(move)
+    return Used(used.lasting + count, used.minute + count)
+
+
+@kernel
+def affordable(share: float, previous: float, used: Used, changes_per_min: float) -> bool:
+    """Whether there is room for a new share, and for the way back to the middle. Without a budget there is."""
     if changes_per_min <= 0.0 or share == previous:
         return True
-    level = used + changes_counted(share - previous) + changes_counted(0.5 - share)
-    return level <= bucket(changes_per_min) + _ROUNDING
+    size = buckets(changes_per_min)
+    there_and_back = changes_counted(share - previous) + changes_counted(0.5 - share) - _ROUNDING
+    return used.lasting + there_and_back <= size.lasting and used.minute + there_and_back <= size.minute
 
 
 @kernel
-def price_factor(used: float, changes_per_min: float) -> float:
+def price_factor(used: Used, changes_per_min: float) -> float:
     """How many times the solver's price a change costs."""
     if changes_per_min <= 0.0:
         return 1.0
-    return DEAREST ** min(used / bucket(changes_per_min), 1.0)
+    size = buckets(changes_per_min)
+    level = min(used.lasting / size.lasting, _FULL)
+    steep = 0.5 * math.pi / (ELASTICITY * size.lasting)
+    hurry = max(2.0 * min(used.minute / size.minute, 1.0) - 1.0, 0.0)
+    return BUSY**level * HURRIED**hurry * (1.0 + steep * math.tan(0.5 * math.pi * level))
 
 
 @kernel

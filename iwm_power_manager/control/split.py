@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from iwm_power_manager.control.budget import changes_counted, leaked
+from iwm_power_manager.control.budget import leaked, spent
 from iwm_power_manager.control.persistence import observed
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.slew import approached
@@ -89,7 +89,7 @@ def split(
         )
         decided = decide(situation, settings, vehicle, policy)
         if policy.changes_per_min > 0.0:
-            used += changes_counted(decided - memory.decided_share)
+            used = spent(used, decided - memory.decided_share)
         decisions += 1
         age = 0.0
     if first:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from iwm_power_manager.control.budget import Used
 from iwm_power_manager.control.persistence import Jitter
 
 
@@ -29,7 +30,7 @@ class Situation(NamedTuple):
     front_slip: float
     rear_slip: float
     previous_share: float
-    changes_used: float
+    changes_used: Used
     jitter: Jitter
     friction: float
     decisions: int

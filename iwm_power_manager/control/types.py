@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from iwm_power_manager.control.budget import Used
 from iwm_power_manager.control.persistence import Jitter, no_jitter
 
 Wheels = tuple[float, float, float, float]  # in the order of `WHEEL_NAMES`
@@ -162,7 +163,7 @@ class SplitMemory(NamedTuple):
     age_s: float
     decided_share: float
     applied_share: float
-    changes_used: float
+    changes_used: Used
     jitter: Jitter
 
 
@@ -302,7 +303,7 @@ def initial_state() -> ControllerState:
     )
     side = SideGrip(friction=0.9, confidence=0.0)
     split = SplitMemory(
-        decisions=0, age_s=0.0, decided_share=0.5, applied_share=0.5, changes_used=0.0, jitter=no_jitter()
+        decisions=0, age_s=0.0, decided_share=0.5, applied_share=0.5, changes_used=Used(0.0, 0.0), jitter=no_jitter()
     )
     return ControllerState(
         steps=0,

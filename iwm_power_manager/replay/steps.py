@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.control import lockstep, monitor, record
-from iwm_power_manager.control.budget import BUCKET_MIN
+from iwm_power_manager.control.budget import buckets
 from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
@@ -296,7 +296,7 @@ def possible_memories(
     downhill = shown._replace(
         split=shown.split._replace(
             age_s=0.0,
-            changes_used=BUCKET_MIN * table.changes_per_min,
+            changes_used=buckets(table.changes_per_min),
             decided_share=1.0 - command.decided_share,
             jitter=jitter,
         ),

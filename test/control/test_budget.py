@@ -30,29 +30,45 @@ SHARE = st.one_of(st.sampled_from([0.0, 0.5, 1.0]), st.floats(0.0, 1.0))
 
 
 @given(st.lists(st.tuples(SHARE, st.floats(0.02, 20.0)), min_size=1, max_size=60), RATE)
-def test_no_stretch_of_time_sees_more_than_its_budget_and_one_bucket(wishes, rate):
-    used, now, share, taken = 0.0, 0.0, 0.5, []
+def test_no_stretch_of_time_sees_more_than_its_budget_and_a_bucket(wishes, rate):
+    used, now, share, taken = budget.Used(0.0, 0.0), 0.0, 0.5, []
     for wish, pause in wishes:
         used, now = budget.leaked(used, pause, rate), now + pause
         if budget.affordable(wish, share, used, rate):
-            used += budget.changes_counted(wish - share)
+            used = budget.spent(used, wish - share)
             taken.append((now, budget.changes_counted(wish - share)))
             share = wish
         assert budget.affordable(0.5, share, used, rate), "the way back to the middle is never barred"
     times, counts = np.array(taken).reshape(-1, 2).T
+    size = budget.buckets(rate)
     for first in range(times.size):
         for last in range(first, times.size):
-            allowed = rate / 60.0 * (times[last] - times[first]) + budget.bucket(rate)
-            assert counts[first : last + 1].sum() <= allowed + 1e-6
+            of_budget = rate / 60.0 * (times[last] - times[first])
+            found = counts[first : last + 1].sum()
+            assert found <= of_budget + size.lasting + 1e-6
+            assert found <= 2.0 * of_budget + size.minute + 1e-6
+            assert times[last] - times[first] > 60.0 or found <= rate + budget.burst(rate) + 1e-6
 
 
-@given(st.floats(0.0, 200.0), st.floats(0.0, 200.0), RATE)
-def test_the_price_never_falls_with_what_is_used_and_ends_at_the_dearest(one, other, rate):
-    low, high = sorted((one, other))
-    cheaper, dearer = budget.price_factor(low, rate), budget.price_factor(high, rate)
-    assert 1.0 <= cheaper <= dearer <= budget.DEAREST
-    assert budget.price_factor(0.0, rate) == 1.0
-    assert budget.price_factor(0.5 * budget.bucket(rate), rate) == pytest.approx(budget.DEAREST**0.5)
+def test_a_minute_may_have_18_changes_beyond_a_budget_of_8():
+    assert budget.burst(8.0) == 18.0
+    assert budget.buckets(8.0) == (40.0, 10.0)
+    assert budget.buckets(0.1) == (2.0, 2.0)
+
+
+USED = st.builds(budget.Used, st.floats(0.0, 600.0), st.floats(0.0, 200.0))
+
+
+@given(USED, USED, RATE)
+def test_the_price_never_falls_with_what_is_used(one, other, rate):
+    both = budget.Used(max(one.lasting, other.lasting), max(one.minute, other.minute))
+    assert 1.0 <= budget.price_factor(one, rate) <= budget.price_factor(both, rate) < 1e4
+    assert budget.price_factor(budget.Used(0.0, 0.0), rate) == 1.0
+
+
+def test_a_second_bucket_costs_nothing_until_it_is_half_full():
+    prices = [budget.price_factor(budget.Used(0.0, minute), 8.0) for minute in (0.0, 5.0, 7.5, 10.0)]
+    assert prices == pytest.approx([1.0, 1.0, np.exp(1.0), np.exp(2.0)])
 
 
 def test_between_the_tabulated_prices_the_logarithm_counts_and_beyond_them_the_last():
@@ -62,5 +78,5 @@ def test_between_the_tabulated_prices_the_logarithm_counts_and_beyond_them_the_l
 
 
 def test_without_a_budget_nothing_is_counted():
-    assert budget.affordable(1.0, 0.0, 1e9, 0.0)
-    assert budget.price_factor(1e9, 0.0) == 1.0
+    assert budget.affordable(1.0, 0.0, budget.Used(1e9, 1e9), 0.0)
+    assert budget.price_factor(budget.Used(1e9, 1e9), 0.0) == 1.0

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control import law
 from iwm_power_manager.control import types as t
-from iwm_power_manager.control.budget import bucket
+from iwm_power_manager.control.budget import Used, buckets, burst
 from iwm_power_manager.control.persistence import no_jitter
 from iwm_power_manager.control.settings import (
     GATE_MODE_LIMITER,
@@ -243,7 +243,7 @@ MEMORIES = st.builds(
         age_s=AGES,
         decided_share=SHARES,
         applied_share=SHARES,
-        changes_used=st.floats(0.0, 12.0),
+        changes_used=st.builds(Used, st.floats(0.0, 40.0), st.floats(0.0, 10.0)),
         jitter=st.just(no_jitter()),
     ),
     wheels=FOUR_STATES,
@@ -637,7 +637,7 @@ def test_the_split_is_decided_once_a_period(dt, period, taken):
     assert steps == list(taken)
 
 
-def test_no_minute_sees_more_changes_than_the_budget_and_one_bucket_whatever_is_demanded():
+def test_no_minute_sees_more_changes_than_the_budget_and_the_burst_whatever_is_demanded():
     table = load_policy(share_path("policies/jalalmaab_2015_none_coupled_mu090.npz")).table()
     s, car = DEFAULT._replace(strategy=SDP_LOOKAHEAD), CARS["none"]
     state, share, changes = initial_state(), 0.5, []
@@ -649,8 +649,8 @@ def test_no_minute_sees_more_changes_than_the_budget_and_one_bucket_whatever_is_
             changes.append(k * 0.01)
             share = command.decided_share
     busiest = max(sum(start <= at < start + 60.0 for at in changes) for start in changes)
-    assert 5 < busiest <= 8.0 + bucket(8.0)
-    assert len(changes) <= 3 * 8.0 + bucket(8.0)
+    assert 8 < busiest <= 8.0 + burst(8.0)
+    assert len(changes) <= 3 * 8.0 + buckets(8.0).lasting
 
 
 def test_equal_split_at_ease_gives_each_motor_a_quarter():

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iwm_power_manager.control import strategies
+from iwm_power_manager.control.budget import Used
 from iwm_power_manager.control.persistence import no_jitter
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.split import decide
@@ -20,6 +21,7 @@ from iwm_power_manager.control.strategies import STRATEGIES, instantaneous
 from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.model.decision import SLIP_DYNAMIC, step_cost_and_next
+from iwm_power_manager.model.pedals import full_power_w
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from oracles import splits
@@ -63,14 +65,14 @@ SLIP = st.floats(-1.2, 0.9)
 SHARE = st.one_of(st.sampled_from(SHARES), st.floats(0.01, 0.99))
 
 
-def situation(power, speed=12.0, front=0.0, rear=0.0, previous=0.3, used=0.0, friction=0.9, decisions=0):
+def situation(power, speed=12.0, front=0.0, rear=0.0, previous=0.3, used=(0.0, 0.0), friction=0.9, decisions=0):
     return Situation(
         power_demand_w=power,
         speed_mps=speed,
         front_slip=front,
         rear_slip=rear,
         previous_share=previous,
-        changes_used=used,
+        changes_used=Used(*used),
         jitter=no_jitter(),
         friction=friction,
         decisions=decisions,
@@ -199,7 +201,9 @@ def test_a_share_from_a_table_stays_within_0_and_1():
     st.floats(-0.15, 0.15),
     st.floats(-0.15, 0.15),
     SHARE,
-    st.sampled_from([0.0, 1.9, 4.0, 8.0, 14.2, 15.0, 16.0]),
+    st.sampled_from(
+        [(0.0, 0.0), (4.0, 1.9), (16.0, 5.5), (30.0, 0.0), (38.2, 4.0), (39.0, 0.0), (10.0, 8.5), (9.0, 9.3)]
+    ),
 )
 def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, rear, previous, used):
     def outcome(share):
@@ -208,7 +212,8 @@ def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, re
 
     for table in (TABLE, BUDGETED):
         ours = lookahead_share(power, speed, front, rear, previous, used, CAR, table)
-        costs = splits.bellman((power, speed, front, rear), previous, table, outcome, used)
+        motors_w = full_power_w(speed, CAR)
+        costs = splits.bellman((power, speed, front, rear), previous, table, outcome, used, motors_w=motors_w)
         assert within_rounding(costs, ours, 1e-6)
 
 
@@ -245,7 +250,7 @@ def test_the_lookahead_keeps_the_front_s_slip_and_the_rear_s_apart(axis, sign):
         discount=1.0,
         problem=TABLE.problem._replace(slip_model=SLIP_DYNAMIC),
     )
-    ours = lookahead_share(6000.0, 12.0, 0.05, -0.02, 0.4, 0.0, CAR, table)
+    ours = lookahead_share(6000.0, 12.0, 0.05, -0.02, 0.4, (0.0, 0.0), CAR, table)
     # Little slip is wanted of an axle that gets nothing, much of one that gets all.
     wanted_of_front = (sign < 0.0) == (axis == 2)
     assert ours == (1.0 if wanted_of_front else 0.0)
@@ -260,22 +265,22 @@ def test_a_dynamic_problem_s_lookahead_starts_from_each_axle_s_own_slip(power, s
         step = step_cost_and_next(power, speed, front, rear, share, CAR, problem)
         return step.cost_j, step.speed_mps, step.slip_front, step.slip_rear
 
-    costs = splits.bellman((power, speed, front, rear), previous, table, outcome, 0.0)
-    assert within_rounding(costs, lookahead_share(power, speed, front, rear, previous, 0.0, CAR, table), 1e-6)
+    costs = splits.bellman((power, speed, front, rear), previous, table, outcome)
+    assert within_rounding(costs, lookahead_share(power, speed, front, rear, previous, (0.0, 0.0), CAR, table), 1e-6)
 
 
 def test_the_lookahead_stays_where_changing_gains_nothing():
     flat = TABLE._replace(expected_cost_j=TABLE.expected_cost_j * 0.0, discount=0.0)
     dear = flat._replace(switching_fixed_cost_j=1e6)
-    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, 0.0, CAR, dear) == 0.3
-    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, 0.0, CAR, flat._replace(switching_cost_j=1e6)) == 0.3
+    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, (0.0, 0.0), CAR, dear) == 0.3
+    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, (0.0, 0.0), CAR, flat._replace(switching_cost_j=1e6)) == 0.3
     free = flat._replace(switching_cost_j=0.0, switching_fixed_cost_j=0.0)
-    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, 0.0, CAR, free) in SHARES
+    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, (0.0, 0.0), CAR, free) in SHARES
 
 
 def test_the_lookahead_does_not_change_for_less_than_rounding():
     twins = TABLE._replace(share=np.array([0.3 - 1e-9, 0.3 + 1e-9]), switching_cost_j=0.0, switching_fixed_cost_j=0.0)
-    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, 0.0, CAR, twins) == 0.3
+    assert lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.3, (0.0, 0.0), CAR, twins) == 0.3
 
 
 def test_the_lookahead_changes_for_a_saving_beyond_rounding():
@@ -289,7 +294,7 @@ def test_the_lookahead_changes_for_a_saving_beyond_rounding():
 
     def share(gain):
         return lookahead_share(
-            4000.0, 12.0, 0.0, 0.0, 0.1, 0.0, CARS[0], free._replace(switching_fixed_cost_j=saving - gain)
+            4000.0, 12.0, 0.0, 0.0, 0.1, (0.0, 0.0), CARS[0], free._replace(switching_fixed_cost_j=saving - gain)
         )
 
     # A milliwatt for 0.1 s.
@@ -307,10 +312,21 @@ def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_
         """Whether the share leaves 0.6, at 3 kW and 12 m/s, where one axle alone is best."""
         return lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.6, used, CAR, table._replace(switching_cost_j=price)) != 0.6
 
-    prices = np.geomspace(1e-3, 1e4, 200)
-    dearest = [max((p for p in prices if moves(p, used)), default=0.0) for used in (0.0, 4.0, 8.0, 14.0, 16.0)]
-    assert dearest[0] > dearest[1] > dearest[2] > dearest[3] > dearest[4] == 0.0
-    assert dearest[0] / dearest[3] == pytest.approx(20.0 ** (14.0 / 16.0), rel=0.15)
+    prices = np.geomspace(1e-3, 1e4, 400)
+
+    def dearest(*used):
+        return max((p for p in prices if moves(p, used)), default=0.0)
+
+    free = dearest(0.0, 0.0)
+    lasting, minute = [
+        [dearest(each, 0.0) for each in (4.0, 20.0, 38.0, 40.0)],
+        [dearest(0.0, each) for each in (6.0, 8.0, 10.0)],
+    ]
+    assert free > lasting[0] > lasting[1] > lasting[2] > lasting[3] == 0.0
+    assert free == dearest(0.0, 5.0) > minute[0] > minute[1] > minute[2] == 0.0
+    # Half a bucket of five minutes' budget: hardly dearer.
+    assert free / lasting[1] == pytest.approx(2.0**0.5 * (1.0 + np.pi / 28.0), rel=0.05)
+    assert free / minute[1] == pytest.approx(np.exp(1.2), rel=0.05)
 
 
 def test_a_demand_that_jitters_is_judged_by_the_mean_of_what_it_jitters_between():
@@ -335,10 +351,10 @@ def test_a_demand_that_jitters_is_judged_by_the_mean_of_what_it_jitters_between(
     steady = STRATEGIES["sdp_lookahead"].choose(
         at._replace(jitter=jitter._replace(gain=1.0)), default_settings("sdp_lookahead"), CAR, free
     )
-    assert steady == lookahead_share(high, 12.0, 0.0, 0.0, previous, 0.0, CAR, free)
+    assert steady == lookahead_share(high, 12.0, 0.0, 0.0, previous, (0.0, 0.0), CAR, free)
 
 
-def choose(strategy, power=1500.0, decisions=0, previous=0.3, speed=12.0, friction=0.9, used=0.0):
+def choose(strategy, power=1500.0, decisions=0, previous=0.3, speed=12.0, friction=0.9, used=(0.0, 0.0)):
     s = default_settings(strategy)
     return decide(situation(power, speed, 0.01, -0.02, previous, used, friction, decisions), s, CAR, TABLE)
 
@@ -350,7 +366,7 @@ def test_every_strategy_is_behind_its_name():
         "instantaneous": cheapest_share(1500.0, 12.0, 0.3, 0.9, False, 0.0, CAR, TABLE),
         "instantaneous_slip": cheapest_share(1500.0, 12.0, 0.3, 0.9, True, 100.0, CAR, TABLE),
         "sdp": table_share(1500.0, 12.0, 0.01, -0.02, 0.3, TABLE),
-        "sdp_lookahead": lookahead_share(1500.0, 12.0, 0.01, -0.02, 0.3, 0.0, CAR, TABLE),
+        "sdp_lookahead": lookahead_share(1500.0, 12.0, 0.01, -0.02, 0.3, (0.0, 0.0), CAR, TABLE),
     }
     assert {name: choose(name) for name in chosen} == chosen
     assert len({0.5, *chosen.values()}) == 6, "strategies that decide alike cannot be told apart"

@@ -89,22 +89,25 @@ def price_units(move):
     return 0.0 if move == 0.0 else (1.0 + min(abs(move) / 0.25, 1.0) + abs(move)) / 3.0
 
 
-def bellman(point, previous, table, outcome, used=0.0, steps=1.0):
+def bellman(point, previous, table, outcome, used=(0.0, 0.0), steps=1.0, motors_w=math.inf):
     """Cost of each share: step, change, and what follows (eq. 31). `outcome(share)` is the step's (cost, v, f, r).
 
-    `used` is what is used of the budget of changes: the tables at dearer prices count for more, the more that is.
-    `steps` is how many times the step counts. With a budget half of eq. 31 is believed, driving; for the other half
-    the step's cost goes on for 0.6 s.
+    `used` is what is used of the two buckets of changes: the tables at dearer prices count for more, the more that is.
+    `steps` is how many times the step counts. With a budget half of eq. 31 is believed, but for braking with more than
+    the motors have; for the other half the step's cost goes on for 0.6 s.
     """
     axes = (table.power_w, table.speed_mps, table.slip_front, table.slip_rear, table.previous_share)
     budget = table.changes_per_min
     tables, level, factor, trust = [table.expected_cost_j, *table.dearer_cost_j], 0.0, 1.0, 1.0
     if budget > 0.0:
-        if point[0] > 0.0:
+        if point[0] > -motors_w:
             trust = 0.5
             steps += 0.5 * (0.6 / table.problem.dt_s - 1.0)
-        full = max(2.0 * budget, 2.0)
-        factor = 20.0 ** min(used / full, 1.0)
+        full = (max(5.0 * budget, 2.0), max(1.25 * budget, 2.0))
+        lasting, minute = (min(of / size, 1.0) for of, size in zip(used, full, strict=True))
+        angle = math.pi / 2.0 * min(lasting, 0.99)
+        factor = 2.0 ** min(lasting, 0.99) * (1.0 + math.pi / (0.7 * full[0]) * math.tan(angle))
+        factor *= math.exp(max(4.0 * minute - 2.0, 0.0))
         level = min(math.log(factor, 3.0), 2.0)
     costs = {}
     for share in (previous, *table.share):
@@ -112,8 +115,8 @@ def bellman(point, previous, table, outcome, used=0.0, steps=1.0):
         at = (point[0], speed, front, rear, share)
         follow_up = np.interp(level, range(len(tables)), [interpolated(axes, each, at) for each in tables])
         move = share - previous
-        way_back = min(abs(0.5 - share) / 0.25, 1.0)
-        if budget > 0.0 and move != 0.0 and used + min(abs(move) / 0.25, 1.0) + way_back > full + 1e-9:
+        needed = min(abs(move) / 0.25, 1.0) + min(abs(0.5 - share) / 0.25, 1.0) - 1e-9
+        if budget > 0.0 and move != 0.0 and any(of + needed > size for of, size in zip(used, full, strict=True)):
             continue
         units = price_units(move) if budget > 0.0 else abs(move)
         changed = factor * table.switching_cost_j * units + table.switching_fixed_cost_j * (move != 0.0)

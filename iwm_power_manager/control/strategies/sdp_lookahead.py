@@ -20,14 +20,15 @@ from iwm_power_manager.grid import interpolate5, locate
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.decision import SLIP_QUASI_STEADY, Settled, settled, settled_step, step_cost_and_next
 from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.pedals import full_power_w
 
 if TYPE_CHECKING:
     from iwm_power_manager.control.settings import Settings
 
 
-#: Part of the forecast that is believed, driving, where changes are budgeted. Changes are made where it is high, and
-#: there it is too high on average: in hindsight they were worth half of it. Braking, what is better just now is no
-#: reason to move brake force about (docs/solver.md).
+#: Part of the forecast that is believed where changes are budgeted. Changes are made where it is high, and there it is
+#: too high on average: in hindsight they were worth half of it. Braking beyond what the motors can do, what is better
+#: just now is no reason to move brake force about (docs/solver.md).
 TRUST = 0.5
 #: For the rest a rule of thumb counts: what is better now stays so for this long, s.
 WORTH_S = 0.6
@@ -118,7 +119,7 @@ def _cost_j(
     gain = situation.jitter.gain
     demand_w = situation.power_demand_w
     trust, steps = 1.0, 1.0
-    if policy.changes_per_min > 0.0 and demand_w > 0.0:
+    if policy.changes_per_min > 0.0 and demand_w > -full_power_w(situation.speed_mps, vehicle):
         trust = TRUST
         steps = TRUST + (1.0 - TRUST) * WORTH_S / policy.problem.dt_s
     samples = 0
