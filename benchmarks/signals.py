@@ -72,8 +72,8 @@ def writers() -> dict[str, Callable[[object], object]]:
     torques, numbers = (1.0, 2.0, 3.0, 4.0), [1.0] * len(SIGNAL_NAMES)
 
     def by_message(_: object) -> object:
-        made = [messages.torque_command_message(5, WHEEL_NAMES, torques) for _ in write]
-        return [serialize_message(m) for m in (*made, messages.named_numbers_message(5, SIGNAL_NAMES, numbers))]
+        made = [messages.joint_message(5, WHEEL_NAMES, effort=torques) for _ in write]
+        return [serialize_message(m) for m in (*made, messages.joint_message(5, SIGNAL_NAMES, position=numbers))]
 
     return {
         "signals": lambda _: [one(5, torques) for one in write] + [write_state(5, numbers)],

@@ -179,7 +179,7 @@ class Session:
         """Publish motor torques beside the power manager."""
         publisher = self.relay.intruder()
         self._extra.append(publisher)
-        publisher.publish(m.torque_command_message(0, m.WHEEL_NAMES, (50.0,) * 4))
+        publisher.publish(m.joint_message(0, m.WHEEL_NAMES, effort=(50.0,) * 4))
 
     def load_processors(self) -> None:
         """Two busy processes for each processor."""

@@ -63,9 +63,9 @@ def relay_main(namespace: str) -> None:
         stamp_ns = m.stamp_to_ns(message.header.stamp)
 
     def answer(_message: Any) -> None:
-        torque = m.torque_command_message(stamp_ns, m.WHEEL_NAMES, (0.0,) * 4)
+        torque = m.joint_message(stamp_ns, m.WHEEL_NAMES, effort=(0.0,) * 4)
         for publisher, message in zip(
-            outputs, (torque, torque, m.named_numbers_message(stamp_ns, SIGNAL_NAMES, zeros)), strict=True
+            outputs, (torque, torque, m.joint_message(stamp_ns, SIGNAL_NAMES, position=zeros)), strict=True
         ):
             publisher.publish(message)
 
@@ -74,7 +74,7 @@ def relay_main(namespace: str) -> None:
         node.create_subscription(m.TOPIC_TYPES[topic], topic, callback, profile)
     node.create_timer(
         _PERIOD_NS / 1e9,
-        lambda: ticks.publish(m.named_numbers_message(node.get_clock().now().nanoseconds, SIGNAL_NAMES, zeros)),
+        lambda: ticks.publish(m.joint_message(node.get_clock().now().nanoseconds, SIGNAL_NAMES, position=zeros)),
     )
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node, SingleThreadedExecutor())

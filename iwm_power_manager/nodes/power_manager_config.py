@@ -8,7 +8,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from iwm_power_manager.control import settings, thresholds
+from iwm_power_manager.control.monitor import BATTERY
 from iwm_power_manager.control.settings import Change
+from iwm_power_manager.control.supervision import STALE_NAMES
 from iwm_power_manager.ros.specs import Spec, yaml_text
 from iwm_power_manager.signals import contract
 from iwm_power_manager.signals.mapping import DEFAULT_MAPPING
@@ -103,10 +105,10 @@ SPECS = (
     ),
     Spec("friction_timeout_s", 2.0, "Age at which road_friction is stale, s.", 0.01, 3600.0, change=Change.ALWAYS),
     Spec("missed_periods", 3, "Periods without a good message after which an input is missing.", 1, 100),
-    Spec("input_period_s.vehicle_speed", 0.01, "Period of vehicle_speed, s.", 0.0005, 10.0),
-    Spec("input_period_s.wheel_states", 0.01, "Period of wheel_states, s.", 0.0005, 10.0),
-    Spec("input_period_s.power_demand", 0.01, "Period of power_demand, s.", 0.0005, 10.0),
-    Spec("input_period_s.battery_state", 0.1, "Period of battery_state, s.", 0.0005, 10.0),
+    *(
+        Spec(f"input_period_s.{name}", 0.1 if name == BATTERY else 0.01, f"Period of {name}, s.", 0.0005, 10.0)
+        for name in STALE_NAMES.values()
+    ),
     *_specs(thresholds.TABLE, dataclasses.asdict(thresholds.Thresholds())),
     Spec(
         "clock_stopped_s",
@@ -115,37 +117,14 @@ SPECS = (
         0.05,
         60.0,
     ),
-    Spec(
-        "execution_warn_us",
-        1000.0,
-        "Execution time of a step above which diagnostics warn, us.",
-        1.0,
-        1e6,
-        change=Change.ALWAYS,
-    ),
-    Spec(
-        "execution_error_us",
-        2000.0,
-        "Execution time of a step above which diagnostics report an error, us.",
-        1.0,
-        1e6,
-        change=Change.ALWAYS,
-    ),
-    Spec(
-        "periodicity_warn_hz",
-        5.0,
-        "Deviation of the mean rate above which diagnostics warn, Hz.",
-        0.1,
-        1000.0,
-        change=Change.ALWAYS,
-    ),
-    Spec(
-        "periodicity_error_hz",
-        10.0,
-        "Deviation of the mean rate above which diagnostics report an error, Hz.",
-        0.1,
-        1000.0,
-        change=Change.ALWAYS,
+    *(
+        Spec(name, at, f"{what} above which diagnostics {do}, {unit}.", low, high, change=Change.ALWAYS)
+        for name, at, what, do, unit, low, high in (
+            ("execution_warn_us", 1000.0, "Execution time of a step", "warn", "us", 1.0, 1e6),
+            ("execution_error_us", 2000.0, "Execution time of a step", "report an error", "us", 1.0, 1e6),
+            ("periodicity_warn_hz", 5.0, "Deviation of the mean rate", "warn", "Hz", 0.1, 1000.0),
+            ("periodicity_error_hz", 10.0, "Deviation of the mean rate", "report an error", "Hz", 0.1, 1000.0),
+        )
     ),
     Spec(
         "gc_off_path",
@@ -204,12 +183,8 @@ def law_settings(values: Mapping[str, Any], strategy: str) -> settings.Settings:
 def age_limits_s(values: Mapping[str, Any]) -> tuple[float, float, float, float]:
     """Ages at which speed, wheels, demand and battery are missing."""
     periods = values["missed_periods"]
-    return (
-        periods * values["input_period_s.vehicle_speed"],
-        periods * values["input_period_s.wheel_states"],
-        periods * values["input_period_s.power_demand"],
-        periods * values["input_period_s.battery_state"],
-    )
+    speed, wheels, demand, battery = (periods * values[f"input_period_s.{name}"] for name in STALE_NAMES.values())
+    return speed, wheels, demand, battery
 
 
 def thresholds_of(values: Mapping[str, Any]) -> thresholds.Thresholds:

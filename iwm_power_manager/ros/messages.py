@@ -109,11 +109,6 @@ def wheel_states_message(
     return joint_message(stamp_ns, names, velocity=speed_radps, effort=torque_nm)
 
 
-def torque_command_message(stamp_ns: int, names: Sequence[str], torque_nm: Sequence[float]) -> JointState:
-    """`wheel_torque_command` or `friction_brake_command`: a torque for each wheel."""
-    return joint_message(stamp_ns, names, effort=torque_nm)
-
-
 def read_torques(message: JointState) -> JointReading:
     """Names and torques (N m) of a command or of `wheel_states`, in the order of the message."""
     return JointReading(stamp_to_ns(message.header.stamp), tuple(message.name), tuple(message.effort))
@@ -148,11 +143,6 @@ def battery_state_message(
     return message
 
 
-def named_numbers_message(stamp_ns: int, names: Sequence[str], values: Sequence[float]) -> JointState:
-    """A list of named numbers as a JointState (`power_manager/state`): `name` is the signal, `position` its value."""
-    return joint_message(stamp_ns, names, position=values)
-
-
 def read_named_numbers(message: JointState) -> tuple[int, dict[str, float]]:
-    """Stamp (ns) and values by name of a message made by `named_numbers_message`."""
+    """Stamp (ns) and values by name of a list of named numbers: `name` is the signal, `position` its value."""
     return stamp_to_ns(message.header.stamp), dict(zip(message.name, message.position, strict=True))

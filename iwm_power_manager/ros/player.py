@@ -9,7 +9,6 @@ in, under the quality of service their publishers had offered.
 
 from __future__ import annotations
 
-import importlib
 import sys
 import time
 from collections.abc import Collection, Iterator
@@ -27,7 +26,7 @@ from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.errors import BagError, one_line
 from iwm_power_manager.ros import ending
 from iwm_power_manager.ros.interruption import Interruption
-from iwm_power_manager.ros.messages import CLOCK, clock_message
+from iwm_power_manager.ros.messages import CLOCK, clock_message, message_class
 from iwm_power_manager.ros.raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET
 from iwm_power_manager.signals.mapping import topic_named
 
@@ -209,12 +208,11 @@ def _publishers(node: Node, bag: BagReader, options: PlayOptions) -> tuple[dict[
 
 def _publisher(node: Node, bag: BagReader, name: str) -> Any:
     topic = bag.topics[name]
-    package, _, rest = topic.type.partition("/")
     if topic.serialization != "cdr":
         raise BagError(f"its messages are {topic.serialization!r}, not CDR")
     try:
-        msg_class = getattr(importlib.import_module(f"{package}.msg"), rest.rpartition("/")[2])
-    except (ImportError, AttributeError, ValueError):
+        msg_class = message_class(topic.type)
+    except (ImportError, ValueError):
         raise BagError(f"type {topic.type} is not installed here") from None
     reliable = not topic.qos or any(profile.reliability is not QosReliability.BEST_EFFORT for profile in topic.qos)
     latched = any(profile.durability is QosDurability.TRANSIENT_LOCAL for profile in topic.qos)

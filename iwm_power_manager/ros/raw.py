@@ -10,7 +10,6 @@ order of arrival across topics.
 
 from __future__ import annotations
 
-import importlib
 import re
 import struct
 import time
@@ -26,6 +25,7 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 
 from iwm_power_manager.bags.metadata import INFINITE
 from iwm_power_manager.ros.intake import Unattended, never_called
+from iwm_power_manager.ros.messages import message_class
 
 #: One message as it was taken: topic number, received (ns), bytes, sent (ns), the publisher's counter.
 Taken = tuple[int, int, bytes, int, int]
@@ -218,12 +218,9 @@ def _asks_more(
 def _message_class(name: str, types: Sequence[str]) -> type:
     if len(types) != 1:
         raise ValueError(f"{name}: not recorded, it carries more than one type: {', '.join(sorted(types))}")
-    package, _, rest = types[0].partition("/")
-    kind, _, message = rest.partition("/")
     try:
-        found: type = getattr(importlib.import_module(f"{package}.{kind}"), message)
-        return found
-    except (ImportError, AttributeError):
+        return message_class(types[0])
+    except ImportError:
         raise ValueError(f"{name}: not recorded, type {types[0]} is not installed here") from None
 
 

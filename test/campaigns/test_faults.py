@@ -159,8 +159,8 @@ class TestSoak:
                 stamp_ns = step * 10_000_000
                 if step >= 3:
                     writer.write(speed, stamp_ns, twist(stamp_ns, 1.0), stamp_ns, step)
-                torque = m.torque_command_message(stamp_ns, m.WHEEL_NAMES, (0.0,) * 4)
-                state = m.named_numbers_message(stamp_ns, ("step", "mode"), (float(step), 1.0))
+                torque = m.joint_message(stamp_ns, m.WHEEL_NAMES, effort=(0.0,) * 4)
+                state = m.joint_message(stamp_ns, ("step", "mode"), position=(float(step), 1.0))
                 for name in topics:
                     # The recorder met the publisher of this one last; and one was lost.
                     if name != m.WHEEL_TORQUE_COMMAND or step not in (1, 5):

@@ -37,7 +37,7 @@ def test_wheels_keep_names_speeds_and_torques(stamp, speeds, torques) -> None:
     message = sent(m.wheel_states_message(stamp, m.WHEEL_NAMES, speeds, torques))
     assert readings.wheel_speeds(message) == (stamp, m.WHEEL_NAMES, speeds)
     assert m.read_torques(message) == (stamp, m.WHEEL_NAMES, torques)
-    command = sent(m.torque_command_message(stamp, m.WHEEL_NAMES, torques))
+    command = sent(m.joint_message(stamp, m.WHEEL_NAMES, effort=torques))
     assert m.read_torques(command) == (stamp, m.WHEEL_NAMES, torques)
     assert len(command.velocity) == len(command.position) == 0
 
@@ -46,7 +46,7 @@ def test_wheels_keep_names_speeds_and_torques(stamp, speeds, torques) -> None:
 def test_named_numbers_come_back_by_name(stamp, values) -> None:
     names = [f"signal_{i}" for i in range(len(values))]
     expected = dict(zip(names, values, strict=True))
-    assert m.read_named_numbers(sent(m.named_numbers_message(stamp, names, values))) == (stamp, expected)
+    assert m.read_named_numbers(sent(m.joint_message(stamp, names, position=values))) == (stamp, expected)
 
 
 @given(stamps, st.floats(0.0, 1.0, width=32), st.floats(-500.0, 500.0, width=32))

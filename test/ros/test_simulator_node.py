@@ -104,8 +104,8 @@ class StandIn:
         self.command(stamp_ns, (max(torque, 0.0),) * 4, (min(torque, 0.0),) * 4)
 
     def command(self, stamp_ns: int, motor: tuple[float, ...], friction: tuple[float, ...], names: Any = NAMES) -> None:
-        self.motors.publish(m.torque_command_message(stamp_ns, names, motor))
-        self.brakes.publish(m.torque_command_message(stamp_ns, names, friction))
+        self.motors.publish(m.joint_message(stamp_ns, names, effort=motor))
+        self.brakes.publish(m.joint_message(stamp_ns, names, effort=friction))
 
     def finish(self) -> int:
         """Serve until the simulator has ended; returns its exit code."""

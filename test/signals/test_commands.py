@@ -46,7 +46,7 @@ def test_without_friction_brakes_alone_the_motors_have_the_projects_own_topic(tm
 @pytest.mark.parametrize("kind", COMMANDS)
 def test_the_standard_command_is_the_joint_state_that_rclpy_writes(kind: str) -> None:
     ((topic, data),) = CommandWriter(FILE, standard()[kind])(5_000_000_007, TORQUES)
-    expected = messages.torque_command_message(5_000_000_007, WHEEL_NAMES, TORQUES)
+    expected = messages.joint_message(5_000_000_007, WHEEL_NAMES, effort=TORQUES)
     assert topic == {MOTOR: messages.WHEEL_TORQUE_COMMAND, FRICTION: messages.FRICTION_BRAKE_COMMAND}[kind]
     assert deserialize_message(data, messages.TOPIC_TYPES[topic]) == expected
 

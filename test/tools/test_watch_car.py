@@ -193,7 +193,7 @@ status = DiagnosticStatus(level=b"\\x01", name=node.get_fully_qualified_name() +
 status.values = car
 other = DiagnosticStatus(level=b"\\x02", name="/another_car/power_manager: control", message="not of this car")
 for i in range(10**9):
-    state.publish(messages.named_numbers_message(i * 10**7, list(values), list(values.values())))
+    state.publish(messages.joint_message(i * 10**7, list(values), position=list(values.values())))
     if i % 20 == 0:
         diagnostics.publish(DiagnosticArray(status=[other, status]))
     time.sleep(0.01)
