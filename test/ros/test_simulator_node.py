@@ -328,7 +328,11 @@ def test_a_parameter_that_does_not_exist_is_refused(capfd, monkeypatch) -> None:
     ("args", "expected"),
     [
         (["--ros-args", "--params-file", "/nowhere.yaml"], "simulator: /nowhere.yaml: cannot be read"),
-        (["--ros-args", "-p", "friction=0.5"], "simulator: Failed to parse ROS arguments: Couldn't parse parameter"),
+        (
+            ["--ros-args", "-p", "friction=0.5"],
+            "simulator: -p 'friction=0.5' is not allowed; allowed: PARAMETER:=VALUE",
+        ),
+        (["--ros-args", "--log-level"], "simulator: Failed to parse ROS arguments: Couldn't parse trailing log level"),
         (["--friction", "0.5"], "simulator: error: unrecognized arguments: --friction 0.5"),
     ],
 )
