@@ -33,6 +33,41 @@ IDL_TEXT = (
     "module my_msgs { module msg { struct Speed {\n"
     'std_msgs::msg::Header header; @unit (value="m/s") double value; }; }; };\n'
 )
+#: As rosidl writes it of a .msg: directives, comments, constants, and annotations whose text goes over several lines.
+ROSIDL_TEXT = """\
+================================================================================
+IDL: my_msgs/msg/Speed
+// generated from rosidl_adapter/resource/msg.idl.em
+
+#include "std_msgs/msg/Header.idl"
+
+module my_msgs {
+  module msg {
+    typedef double double__2[2];
+    module Speed_Constants {
+      const uint8 GOOD = 1;
+      const string UNIT = "m/s";
+    };
+    @verbatim (language="comment", text=
+      "# Speed of the car" "\\n"
+      "as measured")
+    struct Speed {
+      std_msgs::msg::Header header;
+
+      @default (value=0.0)
+      @unit (value="m/s")
+      double value;
+    };
+  };
+};
+================================================================================
+IDL: std_msgs/msg/Header
+#include "builtin_interfaces/msg/Time.idl"
+module std_msgs { module msg { struct Header { builtin_interfaces::msg::Time stamp; string frame_id; }; }; };
+================================================================================
+IDL: builtin_interfaces/msg/Time
+module builtin_interfaces { module msg { struct Time { int32 sec; uint32 nanosec; }; }; };
+"""
 
 
 class Channel(NamedTuple):

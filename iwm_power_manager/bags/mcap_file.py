@@ -82,7 +82,7 @@ class McapFile:
         try:
             self.writer.start(profile, library)
         except OSError:
-            self.remove()
+            self.abandon(remove=True)
             raise
 
     @property
@@ -131,14 +131,11 @@ class McapFile:
         finally:
             self.stream.close()
 
-    def abandon(self) -> None:
-        """Close the file as it is; what is in it can be recovered."""
+    def abandon(self, remove: bool = False) -> None:
+        """Close the file as it is, and delete it or not; what is in it can be recovered."""
         self.stream.close()
-
-    def remove(self) -> None:
-        """Close the file and delete it."""
-        self.stream.close()
-        self.path.unlink(missing_ok=True)
+        if remove:
+            self.path.unlink(missing_ok=True)
 
     def append(self, data: bytes) -> None:
         """Write bytes behind those that are in the file, all or none of them."""

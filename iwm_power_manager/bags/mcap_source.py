@@ -54,6 +54,11 @@ _FOOTER_BYTES = 20
 #: A chunk's record from its first byte to the name of its compression: what to look for behind a damaged stretch.
 _CHUNK_BEGIN = re.compile(b"\x06.{5}\\0\\0\\0.{28}(?:\\0\\0\\0\\0|\x03\\0\\0\\0lz4|\x04\\0\\0\\0zstd)", re.DOTALL)
 
+#: The same, or a message's head: in a file that has messages outside of chunks.
+_ANY_BEGIN = re.compile(b"\x05(?=.{4}\\0{4})|" + _CHUNK_BEGIN.pattern, re.DOTALL)
+#: What may follow a message that is looked for, and costs nothing to look at.
+_FOLLOWING = [bytes([code]) for code in (Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.DATA_END)]
+
 FIRST_PRIVATE = 0x80
 #: Records outside of chunks that are read where they are met: so one sees whether they are what they say.
 _KINDS: dict[int, Any] = {
@@ -94,12 +99,13 @@ def walk(data: Bytes, offset: int = len(MAGIC)) -> Iterator[Record]:
 
     `BagError`: there are more than any honest file has.
     """
-    size = len(data)
+    size, begin = len(data), _CHUNK_BEGIN
     for _ in range(limits.MAX_RECORDS):
         if offset >= size:
             return
         check_whole(data)
-        record = _record_at(data, offset) or Record(UNREADABLE, offset, offset, _next_chunk(data, offset + 1))
+        record = _record_at(data, offset) or Record(UNREADABLE, offset, offset, _next_record(data, offset + 1, begin))
+        begin = _ANY_BEGIN if record.opcode == Opcode.MESSAGE else begin
         yield record
         if record.opcode == Opcode.FOOTER:
             return
@@ -142,10 +148,17 @@ def _stated_length(data: Bytes, opcode: int, body: int, length: int) -> int:
     return max(length, _MESSAGE_FIELDS_BYTES) if opcode == Opcode.MESSAGE else length
 
 
-def _next_chunk(data: Bytes, offset: int) -> int:
-    """Where the next chunk begins whose lengths agree with each other; the end of the file if there is none."""
-    starts = (found.start() for found in _CHUNK_BEGIN.finditer(data, offset))
-    return next((start for start in starts if _record_at(data, start) is not None), len(data))
+def _next_record(data: Bytes, offset: int, begin: re.Pattern[bytes]) -> int:
+    """Where the next chunk, or message that a record follows, begins whose lengths agree; the file's end for none."""
+    starts = (found.start() for found in begin.finditer(data, offset))
+    return next((start for start in starts if _is_begin(data, start)), len(data))
+
+
+def _is_begin(data: Bytes, start: int) -> bool:
+    record = _record_at(data, start)
+    if record is None or record.opcode != Opcode.MESSAGE:
+        return record is not None
+    return data[record.end : record.end + 1] in _FOLLOWING and _record_at(data, record.end) is not None
 
 
 class Definitions:

@@ -273,7 +273,7 @@ class BagWriter:
                     file.writer.add_metadata(metadata.CUSTOM_METADATA, self.custom_data)
                 self._channels = [announce(file, topic) for topic in self._topics]
             except OSError:
-                file.remove()
+                file.abandon(remove=True)
                 raise
         self._file, self._file_start_ns = file, None
         self._add = file.writer.add_message

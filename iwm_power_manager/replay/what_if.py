@@ -62,22 +62,17 @@ class Consumption:
     def add(self, vehicle: VehicleParams, measurement: Measurement, motor_nm: Wheels, brake_nm: Wheels) -> None:
         """One step with these torques."""
         hours = measurement.dt_s / _S_PER_H
-        electrical = work = friction = drag = 0.0
-        for wheel, (speed, torque, brake) in enumerate(
-            zip(measurement.wheel_speed_radps, motor_nm, brake_nm, strict=True)
-        ):
-            motor = _axle(vehicle, wheel).motor
+        electrical = 0.0
+        for wheel, speed in enumerate(measurement.wheel_speed_radps):
+            motor, torque = _axle(vehicle, wheel).motor, motor_nm[wheel]
             electrical += electrical_power_w(torque, speed, motor)
-            dragging = idle_drag_nm(torque, speed, motor) * speed
-            drag += dragging
-            friction += brake * speed
-            work += (torque + brake) * speed - dragging
+            drag = idle_drag_nm(torque, speed, motor) * speed * hours
+            self.idle_drag_wh += drag
+            self.friction_wh += brake_nm[wheel] * speed * hours
+            self.wheel_work_wh += (torque + brake_nm[wheel]) * speed * hours - drag
         self.distance_m += measurement.speed_mps * measurement.dt_s
         self.chemical_wh += chemical_power_w(electrical, vehicle.battery) * hours
         self.electrical_wh += electrical * hours
-        self.wheel_work_wh += work * hours
-        self.friction_wh += friction * hours
-        self.idle_drag_wh += drag * hours
         self.steps += 1
         self.step_s += (measurement.dt_s - self.step_s) / self.steps
         self.friction = min(self.friction[0], measurement.friction), max(self.friction[1], measurement.friction)

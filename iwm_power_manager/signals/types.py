@@ -152,9 +152,12 @@ def _parsed(name: str, encoding: str, text: str) -> dict[str, Any]:
 
     if len(text) > MAX_TEXT_BYTES:
         raise BagError(f"its definition has {len(text)} characters; allowed: <= {MAX_TEXT_BYTES}")
-    text = text.lstrip("\ufeff").replace("\r\n", "\n").replace("\r", "\n").replace("\t", " ")
-    text = re.sub(r"^={40,} *$", _SEPARATOR, text, flags=re.MULTILINE)
+    lines = (line.strip() for line in re.split("[\r\n\f\v\0]+", text.lstrip("\ufeff").replace("\t", " ")))
+    # The grammar of IDL knows no directives, with which each text of rosidl begins.
+    text = "\n".join(line for line in lines if line and not (encoding == IDL and line.startswith("#")))
+    text = re.sub("^={40,}$", _SEPARATOR, text, flags=re.MULTILINE)
     if encoding == MSG:
+        text = re.sub("^MSG: *", "MSG: ", text, flags=re.MULTILINE)
         # The grammar knows no bounded wstring; the bound is not in the bytes.
         return dict(get_types_from_msg(re.sub(r"^(\s*wstring)<=\d+", r"\1", text, flags=re.MULTILINE), name))
     parts = [part.split("\n", 1)[1] for part in text.split(_SEPARATOR + "\n")[1:]] if _SEPARATOR in text else [text]

@@ -56,6 +56,31 @@ def torn(folder: Path, **options: Any) -> Path:
     return folder
 
 
+@pytest.mark.parametrize("damage", ["length", "missing", "more"])
+def test_of_messages_outside_of_chunks_only_what_is_damaged_is_lost(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "bag" / "a_0.mcap"
+    path.parent.mkdir()
+    with path.open("wb") as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start("ros2", "foreign")
+        channel = writer.register_channel("/a", "cdr", 0)
+        for i in range(300):
+            writer.add_message(channel, 1000 + i, b"\0\1\0\0" + bytes([i % 256]) * 40, 1000 + i, i)
+            if i == 200:
+                writer.add_attachment(7, 8, "calib.txt", "text/plain", b"wheel 0.3")
+        writer.finish()
+    content = bytearray(path.read_bytes())
+    at = content.index(bytes([100]) * 40)
+    head = at - 4 - 31
+    content[head : head + 9] = {"length": b"\5" + bytes([255]) * 8, "missing": b"\5", "more": b"\5" + bytes(20)}[damage]
+    path.write_bytes(content)
+    recover(path.parent)
+    found = messages(path.parent)
+    assert [message.sequence for message in found] == [i for i in range(300) if i != 100]
+    with path.open("rb") as stream:
+        assert [attachment.data for attachment in make_reader(stream).iter_attachments()] == [b"wheel 0.3"]
+
+
 def test_schemas_attachments_metadata_and_messages_of_a_torn_file_are_carried_over(tmp_path: Path) -> None:
     folder = torn(tmp_path / "bag")
     before, original = messages(folder), (folder / "a_0.mcap").read_bytes()

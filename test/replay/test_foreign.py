@@ -50,9 +50,23 @@ def with_speed(**changes: str) -> list[foreign.Channel]:
         with_speed(type="my_msgs/Speed"),
         with_speed(text=SPEED.text.replace("\n", "\r\n")),
         with_speed(text="\ufeff" + SPEED.text.replace(" ", "\t")),
+        with_speed(text=SPEED.text.replace("\n", "\r\r\n")),
+        with_speed(text="\n \n" + SPEED.text.replace("\n", " \n\n").replace("MSG: ", "MSG:   ") + "\f\0"),
         with_speed(text=foreign.IDL_TEXT, encoding="ros2idl"),
+        with_speed(text=foreign.ROSIDL_TEXT, encoding="ros2idl"),
+        with_speed(text=foreign.ROSIDL_TEXT.replace("\n", "\r\n"), encoding="ros2idl"),
     ],
-    ids=["as written", "two-part name", "CRLF", "BOM and tabs", "IDL"],
+    ids=[
+        "as written",
+        "two-part name",
+        "CRLF",
+        "BOM and tabs",
+        "CRCRLF",
+        "blanks",
+        "IDL",
+        "rosidl's",
+        "rosidl's, CRLF",
+    ],
 )
 def test_a_type_of_another_package_is_read_by_the_definition_in_the_bag(
     tmp_path: Path, mapping: Path, channels: list[foreign.Channel]
