@@ -59,13 +59,7 @@ class McapFile:
     """
 
     def __init__(
-        self,
-        path: Path,
-        *,
-        library: str,
-        compression: str = "zstd",
-        chunk_bytes: int = 786_432,
-        profile: str = "ros2",
+        self, path: Path, *, library: str, compression: str = "zstd", chunk_bytes: int = 786_432, profile: str = "ros2"
     ) -> None:
         self.path = path
         self.size_bytes = 0

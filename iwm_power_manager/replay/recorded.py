@@ -102,11 +102,7 @@ class SignalStream:
     """
 
     def __init__(
-        self,
-        bag: BagReader,
-        mapping: SignalMapping,
-        vehicle: VehicleParams | None = None,
-        signals: Sequence[str] = (),
+        self, bag: BagReader, mapping: SignalMapping, vehicle: VehicleParams | None = None, signals: Sequence[str] = ()
     ) -> None:
         self.taken: Counter[str] = Counter()
         self.bad: Counter[str] = Counter()

@@ -90,9 +90,7 @@ class Consumption:
 
 
 def what_if(
-    bag: BagReader,
-    plans: Sequence[tuple[str, Plan]],
-    progress: Callable[[int, int], None] | None = None,
+    bag: BagReader, plans: Sequence[tuple[str, Plan]], progress: Callable[[int, int], None] | None = None
 ) -> list[Consumption]:
     """Consumption of the recorded commands, where the bag has them, and of each plan, at the force of the first.
 

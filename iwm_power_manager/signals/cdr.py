@@ -161,13 +161,7 @@ class MessageReader[T]:
     """
 
     def __init__(
-        self,
-        types: Types,
-        fields: Sequence[str],
-        make: Make[T],
-        names: str = "",
-        *,
-        stamped: bool = True,
+        self, types: Types, fields: Sequence[str], make: Make[T], names: str = "", *, stamped: bool = True
     ) -> None:
         self.stamped = stamped and has_header(types)
         self.decoded = 0
