@@ -12,7 +12,7 @@ import os
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
@@ -167,10 +167,24 @@ class BagReader:
         present = [name for name in names if os.path.exists(name)]
         self._damage += [f"{name}: is missing" for name in names if name not in present]
         there = data_files(self.path)
-        self._damage += [
-            f"{name}: is not in metadata.yaml and left out" for name in there if present and name not in present
-        ]
+        known = {*present, *(name for name in there if recovered(name) in present)}
+        left_out = [name for name in there if present and name not in known and _begins_as_data(name, self.path)]
+        self._damage += [f"{name}: is not in metadata.yaml and left out" for name in left_out]
         return present or there
+
+
+def recovered(path: Path) -> Path:
+    """Where a recovered file goes."""
+    return path.with_name(path.name.removesuffix(COMPRESSED_SUFFIX)).with_suffix(".mcap")
+
+
+def _begins_as_data(path: Path, folder: Path) -> bool:
+    """Whether a file is more than what a power cut has left: it begins as one that can be read."""
+    with suppress(BagError, OSError):
+        regular_file(path, folder)
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) in (MAGIC, _SQLITE_MAGIC[: len(MAGIC)]) or path.suffix == COMPRESSED_SUFFIX
+    return False
 
 
 def listed_files(information: Mapping[str, Any]) -> dict[str, None]:

@@ -158,15 +158,10 @@ def _names(path: Path) -> list[Path]:
             raise BagError(f"{path}: is no folder and no .mcap or .db3 file")
         return [path]
     names = reader.data_files(path)
-    names = [name for name in names if _target(name) == name or _target(name) not in names]
+    names = [name for name in names if reader.recovered(name) == name or reader.recovered(name) not in names]
     if not names:
         raise BagError(f"{path}: holds no .mcap or .db3 file")
     return names
-
-
-def _target(path: Path) -> Path:
-    """Where the recovered file goes."""
-    return path.with_name(path.name.removesuffix(reader.COMPRESSED_SUFFIX)).with_suffix(".mcap")
 
 
 class _Gaps:
@@ -216,7 +211,7 @@ class _File:
 
     def rebuild(self) -> None:
         """Write what can be read to a file of its own, and read that."""
-        target = _target(self.path)
+        target = reader.recovered(self.path)
         temporary = target.with_name(target.name + ".recovering")
         try:
             temporary.unlink(missing_ok=True)

@@ -148,6 +148,8 @@ def test_a_compressed_file_becomes_one_beside_it(tmp_path: Path, single: bool, w
     if not single:
         assert messages(folder) == before
         assert recover(folder).lines()[-1] == "  nothing to recover"
+        with BagReader(folder) as reader:  # the original beside it is no damage
+            assert reader.damage == []
 
 
 @pytest.mark.parametrize("single", [True, False], ids=["file", "folder"])
