@@ -130,16 +130,18 @@ class Tally:
     dropped : by reason
     accepted_ns : time of the last accepted one: its stamp, or when it was received if it has none (None: none yet)
     violation : why the last message was dropped, or was accepted with a reservation
-    describe : says more of a message whose values were refused, "" for nothing
+    describe : says more of a message whose values were refused; None: the value, and what is allowed
     stamp_off_s : how far the last stamp that was judged lay from the clock
+    refused : the last value that was refused, and what it may be
     """
 
     received: int = 0
     dropped: Counter[Violation] = field(default_factory=Counter)
     accepted_ns: int | None = None
     violation: Violation = Violation.NONE
-    describe: Callable[[], str] = str
+    describe: Callable[[], str] | None = None
     stamp_off_s: float = 0.0
+    refused: tuple[float, ValueLimits] | None = None
 
     def why(self) -> str:
         """What was wrong with the last message, in words; "" if nothing was."""
@@ -156,7 +158,19 @@ class Tally:
 
     def described(self) -> str:
         """What there is to say of the last message, where its values were refused."""
-        return self.describe() if self.violation in _OF_VALUES else ""
+        if self.violation not in _OF_VALUES:
+            return ""
+        if self.describe or not self.refused:
+            return self.describe() if self.describe else ""
+        value, limits = self.refused
+        return f"{value:g}; allowed: {limits.minimum:g} to {limits.maximum:g}"
+
+    def check_value(self, value: float, last: float, elapsed_s: float, limits: ValueLimits) -> Violation:
+        """Judge a number as `inputs.check_value` does, and remember one that is refused."""
+        violation = check_value(value, last, elapsed_s, limits)
+        if violation is not Violation.NONE:
+            self.refused = value, limits
+        return violation
 
     def age_s(self, now_ns: int) -> float:
         """Time since the last accepted message; infinite before the first."""
@@ -251,7 +265,7 @@ class InputMonitor:
         violation = self._check_stamp(tally, reading.stamp_ns, now_ns)
         if violation is Violation.NONE:
             last = math.nan if tally.accepted_ns is None else self.speed_mps
-            violation = check_value(reading.speed_mps, last, tally.age_s(reading.stamp_ns), self._limits.speed)
+            violation = tally.check_value(reading.speed_mps, last, tally.age_s(reading.stamp_ns), self._limits.speed)
         if violation in _REFUSED_BY_ANOTHER and self._outlasts(
             SPEED, reading.stamp_ns, reading.speed_mps, self._limits.speed, self._limits.rival_s
         ):
@@ -343,9 +357,11 @@ class InputMonitor:
         first = tally.accepted_ns is None
         elapsed_s = tally.age_s(reading.stamp_ns)
         if violation is Violation.NONE:
-            violation = check_value(reading.soc, math.nan if first else self.soc, elapsed_s, self._limits.soc)
+            violation = tally.check_value(reading.soc, math.nan if first else self.soc, elapsed_s, self._limits.soc)
         if violation is Violation.NONE and not math.isnan(reading.temperature_c):
-            violation = check_value(reading.temperature_c, self.temperature_c, elapsed_s, self._limits.temperature)
+            violation = tally.check_value(
+                reading.temperature_c, self.temperature_c, elapsed_s, self._limits.temperature
+            )
         if violation in _REFUSED_BY_ANOTHER and self._outlasts(
             BATTERY, reading.stamp_ns, reading.soc, self._limits.soc, _SLOW * self._limits.rival_s
         ):
@@ -359,7 +375,7 @@ class InputMonitor:
     def take_friction(self, friction: float, now_ns: int) -> bool:
         """Judge `road_friction`; True if it was accepted."""
         tally = self.tallies[FRICTION]
-        if tally.note(check_value(friction, math.nan, 0.0, self._limits.friction), now_ns):
+        if tally.note(tally.check_value(friction, math.nan, 0.0, self._limits.friction), now_ns):
             self.friction = friction
             return True
         return False

@@ -473,3 +473,62 @@ class TestCompleteness:
         # A stamp of before is as good as any now: the clock may have been set back.
         assert monitor.take_speed(SpeedReading(NOW - 50 * MS, 3.0), NOW - 50 * MS)
         assert monitor.take_wheels(wheels(NOW - 50 * MS, (90.0,) * 4), NOW - 50 * MS)
+
+
+class TestWhatIsRefusedSaysWhy:
+    NOW = 1_800_000_000 * 1000 * MS
+
+    @pytest.mark.parametrize(
+        ("stamp_ns", "words"),
+        [
+            (NOW - 200 * MS, "stamp too old: by 0.2 s"),
+            (NOW - 1000 * MS, "stamp too old: by 1 s"),
+            (NOW - 5000 * MS, "stamp too old: by 5 s, another clock? then stamp: source"),
+            (NOW + 5000 * MS, "stamp in future: by 5 s, another clock? then stamp: source"),
+            (
+                12_000 * MS,
+                "stamp too old: by 1.8e+09 s, no stamp? then stamp: source; simulated time? then use_sim_time for both",
+            ),
+        ],
+    )
+    def test_a_stamp_by_how_far_it_is_off_and_what_that_may_mean(self, monitor, stamp_ns, words) -> None:
+        monitor.take_speed(SpeedReading(stamp_ns, 10.0), self.NOW)
+        assert monitor.tallies[SPEED].why() == words
+
+    def test_a_value_by_what_it_was_and_what_it_may_be(self, monitor) -> None:
+        monitor.take_speed(SpeedReading(NOW, 61.0), NOW)
+        monitor.take_battery(battery(NOW, soc=80.0), NOW)
+        monitor.take_friction(math.nan, NOW)
+        monitor.take_demand(1e6, 0.0, NOW)
+        assert [monitor.tallies[topic].why() for topic in (SPEED, BATTERY, FRICTION, DEMAND)] == [
+            "out of range: 61; allowed: -1 to 60",
+            "out of range: 80; allowed: 0 to 1",
+            "not finite: nan; allowed: 0.05 to 1.5",
+            "out of range",  # the node knows who made it
+        ]
+        monitor.take_battery(battery(NOW, temperature=300.0), NOW)
+        assert monitor.tallies[BATTERY].why() == "out of range: 300; allowed: -60 to 150"
+        monitor.take_speed(SpeedReading(NOW, 1.0), NOW)
+        assert monitor.tallies[SPEED].why() == ""
+
+    @pytest.mark.parametrize(
+        ("values", "names", "words"),
+        [
+            ((1.0, 2.0, 3.0), NAMES, "length: 3 values for 4 wheels"),
+            (
+                (math.nan, math.nan, 1.0, 900.0),
+                NAMES,
+                "axle lost: front_left absent, front_right absent, rear_right out of range",
+            ),
+            (
+                (1.0, 1.0),
+                ("front_left", "x"),
+                "axle lost: front_right absent, rear_left absent, rear_right absent; "
+                "the message names 'front_left', 'x'",
+            ),
+            ((), (), "axle lost: " + ", ".join(f"{name} absent" for name in NAMES) + "; the message names nothing"),
+        ],
+    )
+    def test_wheels_by_which_are_lost_and_how_those_that_came_are_called(self, monitor, values, names, words) -> None:
+        monitor.take_wheels(wheels(NOW, values, names), NOW)
+        assert monitor.tallies[WHEELS].why() == words

@@ -332,6 +332,13 @@ def test_wheels_of_other_names_are_told_with_the_names_that_came(start_own) -> N
     pair.bench.drive(lambda: "length: 3 values for 4 wheels" in log(), "the shape", wheels=(1.0, 1.0, 1.0))
 
 
+def test_a_charge_in_percent_is_told_with_its_number_and_what_is_allowed(start_own) -> None:
+    pair = start_own()
+    pair.bench.connect()
+    said = "messages refused, out of range: 80; allowed: 0 to 1)"
+    pair.bench.drive(lambda: "battery_state" in said_with(pair, said), "the number", soc=80.0)
+
+
 class TestParameters:
     @pytest.mark.parametrize(
         ("name", "value"),
