@@ -18,7 +18,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -28,22 +28,8 @@ STARTED_NS = time.time_ns() - 20_000_000
 
 _BUILDING = threading.RLock()
 
-
-class Watch(Protocol):
-    """Hears of each kernel that has to be compiled for a call from Python."""
-
-    def begin(self, kernel: str, functions: int) -> None:
-        """Compiling begins; so many functions are compiled for it."""
-
-    def ready(self) -> None:
-        """One of them is."""
-
-    def end(self) -> None:
-        """It is compiled, or was found to be no good."""
-
-
-#: Whoever shows the user what is being compiled.
-watch: Watch | None = None
+#: What shows the user what is being compiled: `begin(kernel, functions)`, then `ready()` for each of them, and `end()`.
+watch: Any = None
 
 
 class Kernel:

@@ -61,8 +61,7 @@ class _Compiling:
 
     def __init__(self) -> None:
         self._said = False
-        self._bar: Bar | None = None
-        self._over = threading.Event()
+        self._bar, self._over = Bar(0, "", quiet=True), threading.Event()
 
     def begin(self, kernel: str, functions: int) -> None:
         """Show it; the first time, why there is something to wait for."""
@@ -70,24 +69,21 @@ class _Compiling:
             tqdm.write("compiling for this machine: a minute or some, once after an installation or update", sys.stderr)
         self._said = True
         self._bar, self._over = Bar(functions, "functions", f"compiling {kernel.split('.', 1)[-1]}"), threading.Event()
-        threading.Thread(target=_keep_alive, args=(self._bar, self._over), daemon=True).start()
+        threading.Thread(target=self._keep_alive, args=(self._bar, self._over), daemon=True).start()
+
+    @staticmethod
+    def _keep_alive(bar: Bar, over: threading.Event) -> None:
+        while not over.wait(1.0):
+            bar.refresh()
 
     def ready(self) -> None:
         """One more function."""
-        if self._bar is not None:
-            self._bar.update()
+        self._bar.update()
 
     def end(self) -> None:
         """Take it away."""
         self._over.set()
-        if self._bar is not None:
-            self._bar.close()
-        self._bar = None
-
-
-def _keep_alive(bar: Bar, over: threading.Event) -> None:
-    while not over.wait(1.0):
-        bar.refresh()
+        self._bar.close()
 
 
 def show_compiling(*, quiet: bool = False) -> None:
