@@ -11,7 +11,7 @@ from iwm_power_manager.control import settings, thresholds
 from iwm_power_manager.control.monitor import BATTERY
 from iwm_power_manager.control.settings import Change
 from iwm_power_manager.control.supervision import STALE_NAMES
-from iwm_power_manager.ros.specs import Spec, yaml_text
+from iwm_power_manager.ros.specs import Spec
 from iwm_power_manager.signals import contract
 from iwm_power_manager.signals.mapping import DEFAULT_MAPPING
 
@@ -190,12 +190,3 @@ def age_limits_s(values: Mapping[str, Any]) -> tuple[float, float, float, float]
 def thresholds_of(values: Mapping[str, Any]) -> thresholds.Thresholds:
     """What inputs are believed, and how the degraded state goes."""
     return thresholds.Thresholds(**{name: values[name] for name in thresholds.TABLE})
-
-
-def parameter_file() -> str:
-    """Content of `config/nodes/power_manager.yaml`."""
-    return yaml_text(
-        SPECS,
-        "Parameters of the power manager, all of them, with their defaults. Ranges: docs/interface.md, or "
-        "`ros2 param describe`. Written by scripts/update_interface.",
-    )

@@ -7,7 +7,6 @@ Execution time is measured on the processor's own clock: it is real whatever the
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -51,19 +50,6 @@ def to_message(stamp_ns: int, node_name: str, statuses: Sequence[Status]) -> Dia
     return message
 
 
-@dataclass
-class _Window:
-    """What was measured since the last report; times in s."""
-
-    steps: int = 0
-    execution_sum_s: float = 0.0
-    execution_max_s: float = 0.0
-    periods: int = 0
-    period_sum_s: float = 0.0
-    period_min_s: float = math.inf
-    period_max_s: float = 0.0
-
-
 class LoopStatistics:
     """Periods and execution times of the control loop.
 
@@ -74,20 +60,15 @@ class LoopStatistics:
 
     def __init__(self) -> None:
         self.steps = 0
-        self._window = _Window()
+        self._execution_s: list[float] = []
+        self._period_s: list[float] = []
 
     def add(self, period_s: float | None, execution_s: float) -> None:
         """Count a step; `period_s` is None where there is no previous step."""
-        window = self._window
         self.steps += 1
-        window.steps += 1
-        window.execution_sum_s += execution_s
-        window.execution_max_s = max(window.execution_max_s, execution_s)
+        self._execution_s.append(execution_s)
         if period_s is not None:
-            window.periods += 1
-            window.period_sum_s += period_s
-            window.period_min_s = min(window.period_min_s, period_s)
-            window.period_max_s = max(window.period_max_s, period_s)
+            self._period_s.append(period_s)
 
     def report(self, rate_hz: float | None, limits: Mapping[str, float]) -> Status:
         """State of the control loop since the last call, judged as ros2_control does; starts measuring anew.
@@ -97,19 +78,20 @@ class LoopStatistics:
         rate_hz : the rate that was asked for; None in lock-step, where there is none
         limits : execution_warn_us, execution_error_us, periodicity_warn_hz, periodicity_error_hz
         """
-        window, self._window = self._window, _Window()
+        executions_s, self._execution_s = self._execution_s, []
+        periods_s, self._period_s = self._period_s, []
         problems: list[tuple[int, str]] = []
-        values = {"steps": str(self.steps), "steps since the last report": str(window.steps)}
-        if window.steps:
-            mean_us = window.execution_sum_s / window.steps * 1e6
+        values = {"steps": str(self.steps), "steps since the last report": str(len(executions_s))}
+        if executions_s:
+            mean_us = sum(executions_s) / len(executions_s) * 1e6
             values["execution time, mean (us)"] = f"{mean_us:.0f}"
-            values["execution time, max (us)"] = f"{window.execution_max_s * 1e6:.0f}"
+            values["execution time, max (us)"] = f"{max(executions_s) * 1e6:.0f}"
             problems += _beyond(mean_us, limits, "execution", "us", "mean execution time")
-        if window.period_sum_s > 0.0:
-            mean_hz = window.periods / window.period_sum_s
+        if sum(periods_s) > 0.0:
+            mean_hz = len(periods_s) / sum(periods_s)
             values["rate, mean (Hz)"] = f"{mean_hz:.2f}"
-            values["period, min (ms)"] = f"{window.period_min_s * 1e3:.3f}"
-            values["period, max (ms)"] = f"{window.period_max_s * 1e3:.3f}"
+            values["period, min (ms)"] = f"{min(periods_s) * 1e3:.3f}"
+            values["period, max (ms)"] = f"{max(periods_s) * 1e3:.3f}"
             if rate_hz is not None:
                 problems += _beyond(
                     abs(mean_hz - rate_hz), limits, "periodicity", "hz", f"deviation from {rate_hz:g} Hz"

@@ -15,7 +15,8 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros.arguments import check_arguments, check_parameter_files
 from iwm_power_manager.ros.parameters import Change, Spec, check_change, descriptor
-from iwm_power_manager.ros.specs import ParameterError, markdown_table, yaml_text
+from iwm_power_manager.ros.specs import ParameterError
+from parameter_pages import markdown_table, yaml_text
 
 SPECS = {
     spec.name: spec

@@ -18,6 +18,7 @@ from iwm_power_manager.files import read_yaml
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.ros import messages, qos
 from iwm_power_manager.share import resolve
+from parameter_pages import parameter_file
 
 MODULE = "iwm_power_manager.nodes.power_manager"
 DOMAIN = int(os.environ["ROS_DOMAIN_ID"])
@@ -169,7 +170,7 @@ def test_inputs_are_heard_from_best_effort_publishers(start_pair) -> None:
 
 def test_the_parameter_file_holds_every_parameter_with_its_default() -> None:
     path = resolve("config/nodes/power_manager.yaml")
-    assert path.read_text() == config.parameter_file(), "run scripts/update_interface"
+    assert path.read_text() == parameter_file(), "run scripts/update_interface"
     values = read_yaml(path)["/**"]["ros__parameters"]
     flat = {}
     for key, value in values.items():
