@@ -7,6 +7,7 @@ import argparse
 import dataclasses
 import functools
 import tempfile
+import textwrap
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -231,7 +232,7 @@ def _paper(options: argparse.Namespace) -> None:
         for table in tables:
             title = table.title if table.section == TABLES else f"{table.section}: {table.title}"
             print(f"{title}\n{plain_table(table.rows, table.columns, screen())}\n")
-        print(f"{table.note}\n{_policies_text(policies)}")
+        print(f"{textwrap.fill(table.note, screen())}\n{_policies_text(policies)}")
     if options.json:
         rows = [row.to_json() for table in tables for cell in table.rows for row in cell.values()]
         write_json(options.json, {"package_version": __version__, "table": options.paper, "rows": rows})
@@ -264,7 +265,8 @@ def _ablation(options: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory(prefix="iwm-ablation-") as folder:
         rows = ablation.ablation(policies, Path(folder), options.jobs, say, quiet=options.quiet)
     if not options.quiet:
-        print(f"{plain_table(rows, ablation.columns(rows), screen())}\n{ABLATION_NOTE}\n{_policies_text(policies)}")
+        note = textwrap.fill(ABLATION_NOTE, screen())
+        print(f"{plain_table(rows, ablation.columns(rows), screen())}\n{note}\n{_policies_text(policies)}")
     if options.json:
         content = {"package_version": __version__, "rows": [dataclasses.asdict(row) for row in rows]}
         write_json(options.json, content)

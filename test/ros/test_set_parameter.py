@@ -67,10 +67,10 @@ def test_what_is_refused_is_one_line(pair, argument: str, code: int, problem: st
 
 
 def test_a_node_that_is_not_there_is_one_line_which_names_those_that_are(pair) -> None:
-    done = run(pair, "--node", "/nobody/here", "--patience", "4")
+    done = run(pair, "--node", "/nobody/here", "--patience", "10")
     there = f"{pair.bench.node.get_namespace()}/power_manager"
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert done.stderr.startswith("set_parameter: /nobody/here: no such node on this domain within 4 s; there is ")
+    assert done.stderr.startswith("set_parameter: /nobody/here: no such node on this domain within 10 s; there is ")
     assert there in done.stderr
 
 
