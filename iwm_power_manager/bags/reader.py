@@ -166,11 +166,14 @@ class BagReader:
         names = [self.path / name for name in listed_files(self.information)]
         present = [name for name in names if os.path.exists(name)]
         self._damage += [f"{name}: is missing" for name in names if name not in present]
-        there = data_files(self.path)
-        known = {*present, *(name for name in there if recovered(name) in present)}
-        left_out = [name for name in there if present and name not in known and _begins_as_data(name, self.path)]
-        self._damage += [f"{name}: is not in metadata.yaml and left out" for name in left_out]
-        return present or there
+        if not present:
+            return data_files(self.path)
+        with suppress(BagError):  # a folder that may be entered and not listed
+            there = data_files(self.path)
+            known = {*present, *(name for name in there if recovered(name) in present)}
+            left_out = [name for name in there if name not in known and _begins_as_data(name, self.path)]
+            self._damage += [f"{name}: is not in metadata.yaml and left out" for name in left_out]
+        return present
 
 
 def recovered(path: Path) -> Path:

@@ -260,6 +260,17 @@ def test_a_data_file_that_metadata_does_not_list_is_said_to_be_left_out(make_bag
         assert len(list(reader.messages())) == 10
 
 
+def test_a_bag_in_a_folder_that_may_be_entered_and_not_listed_is_read() -> None:
+    with private_folder() as folder:
+        with BagWriter(folder / "bag") as bag:
+            bag.write(bag.add_topic(topic("/a")), 1, float64(1.0))
+        (folder / "bag").chmod(0o111)
+        with BagReader(folder / "bag") as reader:
+            assert len(list(reader.messages())) == 1
+            assert reader.damage == []
+        (folder / "bag").chmod(0o755)
+
+
 def test_a_database_without_its_last_byte_is_damaged(tmp_path: Path) -> None:
     path = written_by_rosbags(tmp_path / "bag", StoragePlugin.SQLITE3)
     (file,) = path.glob("*.db3")
