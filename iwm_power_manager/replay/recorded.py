@@ -129,6 +129,9 @@ class SignalStream:
         if any(demand in wanted for demand in DEMANDS):
             wanted = [signal for signal in wanted if signal not in PEDALS]
         self.signals = set(wanted)
+        sources = mapping.sources.get("wheel_speed", ())
+        own = [held.get(source.topic, source.topic) for source in sources if len(sources) > 1]
+        self._topic_of = dict(zip(WHEEL_NAMES, own, strict=False))  # of each wheel that has one of its own
         readers = (
             readings.topic_readers(mapping, types, readings.Assembly(WHEEL_NAMES, vehicle), wanted) if wanted else {}
         )
@@ -185,7 +188,8 @@ class SignalStream:
             if isinstance(reading, JointReading) and not all(map(math.isfinite, reading.values)):
                 pairs = zip(reading.names, reading.values, strict=False)  # in the order of the message
                 missing = [name for name, value in pairs if not math.isfinite(value)]
-                self.without[f"{topic}: {', '.join(missing)}"] += 1
+                where = dict.fromkeys(self._topic_of.get(name, topic) for name in missing)
+                self.without[f"{', '.join(where)}: {', '.join(missing)}"] += 1
         stamped = reader.stamped
         if stamped and not self._by_stamp:
             stamped = False

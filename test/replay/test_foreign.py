@@ -218,6 +218,27 @@ def test_speed_and_wheels_that_are_not_in_the_units_they_are_read_in_are_said(
     assert all(hint in note for note in report.notes)
 
 
+@pytest.mark.parametrize("silent", [True, False])
+def test_a_wheel_of_its_own_topic_that_says_nothing_is_named_with_that_topic(
+    tmp_path: Path, mapping: Path, silent: bool
+) -> None:
+    wheels = [DEMAND._replace(topic=f"/w{i}") for i in range(4)]
+    entries = [entry for entry in drive() if entry[1] != 2]
+    for t, _, data in [entry for entry in drive() if entry[1] == 2]:
+        speeds = struct.unpack("<4d", data[-36:-4])
+        entries += [
+            (t + i, 2 + i, b"\0\1\0\0" + struct.pack("<d", foreign.NAN if i == 2 else speeds[i]))
+            for i in range(4)
+            if not (silent and i == 2)
+        ]
+    topics = "".join(f"    - {{topic: /w{i}, field: data, unit: rad/s}}\n" for i in range(4))
+    lines = foreign.MAPPING.splitlines(keepends=True)
+    mapping.write_text("".join(f"  wheel_speed:\n{topics}" if "wheel_speed" in line else line for line in lines))
+    report, _ = replayed(write_bag(tmp_path / "bag", sorted(entries), [SPEED, DEMAND, *wheels]), mapping)
+    (note,) = report.notes
+    assert note.startswith("/w2: rear_left has no number in ")
+
+
 def test_compressed_messages_are_read_without_any_metadata(tmp_path: Path, mapping: Path) -> None:
     entries = [(t, n, zstandard.compress(data)) for t, n, data in drive()]
     path = write_mcap(tmp_path / "a_0.mcap", entries)
