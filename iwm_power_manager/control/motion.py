@@ -15,7 +15,8 @@ acceleration that nothing explains, until the same vote says otherwise. An accel
 once whether the forces or the speeds are right.
 
 A wheel is not believed when it does what no torque can: slows down faster than its brake can, or stays away from the
-car's speed although nothing holds it. A wheel that skids does neither.
+car's speed although nothing holds it. A wheel that skids does neither. Four that jump by one factor while the sensor
+does not are corrected by it: no road loses its grip under both axles in the same step.
 """
 
 from __future__ import annotations
@@ -87,8 +88,10 @@ HELD_PART, HELD_MPS = 0.02, 0.1
 AGAINST_PART, AGAINST_MPS = 0.05, 0.3
 #: A sensor and wheels that differ by no more than this may both be right: tyres, or a wrong radius.
 LEAST_PART = 0.72
-#: Wheels that are all wrong are believed to be so by one factor within this and its inverse.
-LEAST_FACTOR = 0.6
+#: Wheels that are all wrong are believed to be so by one factor within this and its inverse; one within the second part
+#: of 1 is tyre wear. What they jump by in the same step, rad/s, and how far their factors may be apart.
+LEAST_FACTOR, WORN_PART = 0.6, 0.05
+COMMON_RADPS, COMMON_PART, CALM_S = 0.5, 0.03, 0.05
 #: No road force is larger than this part of the wheel's static load.
 MOST_FRICTION = 2.0
 #: Bits of `Motion.doubted`: the wheels in their order, then the speed sensor.
@@ -330,6 +333,8 @@ def _fresh(speed_mps: float, bias_mps2: float, shown_mps: float, brake_gain: Whe
         wheel_doubt_s=NO_WHEELS,
         agreed=Agreed(0.0, 0.0, 0.0, 0.0),
         brake_gain=brake_gain,
+        wheels_factor=1.0,
+        calm_s=0.0,
     )
 
 
@@ -559,7 +564,7 @@ def _doubts(
 
 @kernel
 def _used_wheels(
-    w: Wheels, rims: Wheels, doubt: Wheels, used_mps: float, believed: int, demand_w: float, vehicle: VehicleParams
+    w: Wheels, doubt: Wheels, used_mps: float, believed: int, demand_w: float, vehicle: VehicleParams
 ) -> Wheels:
     """Wheel speeds to use.
 
@@ -569,17 +574,62 @@ def _used_wheels(
     front, rear = vehicle.front.wheel.radius_m, vehicle.rear.wheel.radius_m
     if believed == 0:
         sign = 1.0 if used_mps >= 0.0 else -1.0
-        a, b, c, d = sign * rims[0], sign * rims[1], sign * rims[2], sign * rims[3]
+        a, b, c, d = _rims(_times(sign, w), vehicle)
         best = max(a, b, c, d) if demand_w < 0.0 else min(a, b, c, d)
         factor = abs(used_mps) / best if best > 0.0 else 0.0
         if LEAST_FACTOR < factor < 1.0 / LEAST_FACTOR:
-            return (factor * w[0], factor * w[1], factor * w[2], factor * w[3])
+            return _times(factor, w)
     return (
         _used(w[0], doubt[0], w[1], doubt[1], used_mps / front),
         _used(w[1], doubt[1], w[0], doubt[0], used_mps / front),
         _used(w[2], doubt[2], w[3], doubt[3], used_mps / rear),
         _used(w[3], doubt[3], w[2], doubt[2], used_mps / rear),
     )
+
+
+@kernel
+def _times(factor: float, w: Wheels) -> Wheels:
+    return (factor * w[0], factor * w[1], factor * w[2], factor * w[3])
+
+
+@kernel
+def _combined(factor: float, more: float) -> float:
+    """What the wheels are multiplied by from now on."""
+    both = factor * more
+    if both < LEAST_FACTOR or both > 1.0 / LEAST_FACTOR:
+        return factor
+    return 1.0 if abs(both - 1.0) <= WORN_PART else both
+
+
+@kernel
+def _jumped_by(
+    shown: float, w: Wheels, wheels: FourWheels, travel: float, dt: float, before: MotionState, vehicle: VehicleParams
+) -> tuple[float, float]:
+    """Factor that undoes a jump of all four wheels in this step which neither their torques nor the sensor explain.
+
+    The torque explains what the road did not take of it in the last step. That is known while the wheels have done what
+    it says for a while, which is the second number: after a message that is late, nothing explains their changes.
+    """
+    speed = before.speed_mps
+    d = before.wheel_doubt_s
+    near = abs(shown - speed) <= SPEED_PART * abs(speed) + SPEED_MPS
+    odd = near and before.doubt_s == 0.0 and max(d[0], d[1], d[2], d[3]) == 0.0 and before.calm_s > CALM_S
+    rest, low, high, new = 0.0, math.inf, -math.inf, False
+    for i in range(4):
+        old = travel * wheels[i].speed_radps
+        inertia = vehicle.front.wheel.inertia_kgm2 if i < 2 else vehicle.rear.wheel.inertia_kgm2
+        gained = travel * (wheels[i].total_nm - wheels[i].road_nm) * dt / inertia
+        change = w[i] - old
+        rest += 0.25 * (change - gained)
+        new = new or change != 0.0
+        over = change - min(max(change, min(gained, 0.0)), max(gained, 0.0))
+        if abs(over) <= COMMON_RADPS or w[i] * old <= 0.0:
+            odd = False
+        else:
+            part = (old + gained) / w[i]
+            low, high = min(low, part), max(high, part)
+    calm_s = before.calm_s + dt if new and abs(rest) <= COMMON_RADPS else 0.0
+    return 0.5 * (low + high) if odd and high - low <= COMMON_PART else 1.0, calm_s
 
 
 @kernel
@@ -614,12 +664,16 @@ def estimate(
     first : the first step of a run: nothing is known from before
     """
     shown = measurement.speed_mps
-    w = measurement.wheel_speed_radps
     dt = measurement.dt_s
-    front, rear = vehicle.front.wheel.radius_m, vehicle.rear.wheel.radius_m
-    rims = (w[0] * front, w[1] * front, w[2] * rear, w[3] * rear)
+    raw = measurement.wheel_speed_radps
     if first:
-        before = _started(shown, rims)
+        before = _started(shown, _rims(raw, vehicle))
+    factor, calm_s = before.wheels_factor, 0.0
+    if not first:
+        jump, calm_s = _jumped_by(shown, _times(factor, raw), wheels, travel, dt, before, vehicle)
+        factor = _combined(factor, jump)
+    w = _times(factor, raw)
+    rims = _rims(w, vehicle)
     turning = _turning(w, wheels, travel, first, dt, before.wheel_doubt_s, vehicle)
     forces = _forces_mps2(turning.road_nm, vehicle)
     acceleration = 0.0
@@ -643,16 +697,12 @@ def estimate(
         ratio = shown / reference
         if LEAST_PART < ratio < 1.0:
             part = ratio
-    doubted = 0 if trusted else DOUBT_SPEED
-    for i in range(4):
-        if doubt[i] > 0.0:
-            doubted |= 1 << i
     motion = Motion(
         speed_mps=used,
         uncertainty_mps=0.1 + SPEED_PART * abs(used) if trusted else SPEED_MPS + 2.0 * WHEEL_PART * abs(used),
-        wheel_speed_radps=_used_wheels(w, rims, doubt, used, rolling.believed, demand, vehicle),
+        wheel_speed_radps=_used_wheels(w, doubt, used, rolling.believed, demand, vehicle),
         lower_part=part,
-        doubted=doubted,
+        doubted=_doubted(trusted, doubt, factor),
     )
     after = MotionState(
         speed_mps=reference,
@@ -666,8 +716,26 @@ def estimate(
         wheel_doubt_s=doubt,
         agreed=agreed,
         brake_gain=before.brake_gain,
+        wheels_factor=factor,
+        calm_s=calm_s,
     )
     return motion, after
+
+
+@kernel
+def _doubted(trusted: bool, doubt_s: Wheels, factor: float) -> int:
+    """Bits of what is not believed."""
+    bits = 0 if trusted else DOUBT_SPEED
+    for i in range(4):
+        if doubt_s[i] > 0.0 or factor != 1.0:
+            bits |= 1 << i
+    return bits
+
+
+@kernel
+def _rims(w: Wheels, vehicle: VehicleParams) -> Wheels:
+    front, rear = vehicle.front.wheel.radius_m, vehicle.rear.wheel.radius_m
+    return (w[0] * front, w[1] * front, w[2] * rear, w[3] * rear)
 
 
 @kernel

@@ -197,6 +197,8 @@ class MotionState(NamedTuple):
     wheel_doubt_s : time each wheel has yet to be good
     agreed : speeds that outvote the forces
     brake_gain : part of a friction torque that each brake gives, as found
+    wheels_factor : what all four wheel speeds are multiplied by, since they are wrong by its inverse
+    calm_s : for how long the wheels have done what torques and road say
     """
 
     speed_mps: float
@@ -210,6 +212,8 @@ class MotionState(NamedTuple):
     wheel_doubt_s: Wheels
     agreed: Agreed
     brake_gain: Wheels
+    wheels_factor: float
+    calm_s: float
 
 
 class WheelGrip(NamedTuple):
@@ -323,6 +327,8 @@ def initial_state() -> ControllerState:
             wheel_doubt_s=none,
             agreed=Agreed(lasted_s=0.0, from_mps=0.0, moved_mps=0.0, felt_mps=0.0),
             brake_gain=(1.0, 1.0, 1.0, 1.0),
+            wheels_factor=1.0,
+            calm_s=0.0,
         ),
         travel=1.0,
         hold_nm=0.0,

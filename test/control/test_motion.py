@@ -44,8 +44,10 @@ class Car:
         m = Measurement(spoil_speed(self.v), shown, float(demand), DT, 0.9, 1e5, 1e5, 0.5)
         self.motion, after = estimate(m, self.state.motion, self.state.wheels, 1.0, self.state.steps == 0, CAR)
         memory = tuple(
-            wheel._replace(total_nm=float(torque), speed_radps=float(w))
-            for wheel, w in zip(self.state.wheels, shown, strict=True)
+            wheel._replace(
+                total_nm=float(torque), speed_radps=w, road_nm=wheel.total_nm - INERTIA * (w - wheel.speed_radps) / DT
+            )
+            for wheel, w in zip(self.state.wheels, self.motion.wheel_speed_radps, strict=True)
         )
         self.state = self.state._replace(steps=self.state.steps + 1, motion=after, wheels=memory)
         self.v += DT * (
@@ -204,9 +206,68 @@ def test_wheels_that_are_all_wrong_by_one_factor_still_tell_the_one_that_locks()
         motion = car.step(-100.0, spoil_wheels=lambda w: [0.8 * x for x in w])
     assert motion.doubted == 15
     assert motion.wheel_speed_radps == pytest.approx((motion.speed_mps / RADIUS,) * 4)
-    motion = car.step(-100.0, spoil_wheels=lambda w: [0.4 * w[0], *(0.8 * x for x in w[1:])])
+    for k in range(21):
+        locking = 0.8 - 0.02 * k
+        motion = car.step(-400.0, spoil_wheels=lambda w, part=locking: [part * w[0], *(0.8 * x for x in w[1:])])
     assert motion.wheel_speed_radps[0] == pytest.approx(0.5 * motion.speed_mps / RADIUS)
     assert motion.wheel_speed_radps[1:] == pytest.approx((motion.speed_mps / RADIUS,) * 3)
+
+
+@pytest.mark.parametrize("torque", [-600.0, -100.0, 0.0, 150.0])
+@pytest.mark.parametrize("factor", [0.78, 0.9, 1.1, 1.25])
+def test_all_wheels_that_jump_by_one_factor_at_low_speed_are_corrected_until_they_jump_back(factor, torque):
+    car = Car(9.0)
+    for k in range(60):
+        wrong = factor if 20 <= k < 40 else 1.0
+        v = car.v
+        motion = car.step(torque, spoil_wheels=lambda w, wrong=wrong: [wrong * x for x in w])
+        assert motion.speed_mps == v
+        assert motion.wheel_speed_radps == pytest.approx((v / RADIUS,) * 4, rel=0.02)
+        assert motion.doubted == (15 if wrong != 1.0 else 0)
+        assert motion.lower_part == 1.0
+
+
+def test_wheels_that_come_late_have_not_jumped():
+    car, shown = Car(7.0), None
+    for k in range(50):
+        shown = shown if k % 14 in (12, 13) else list(car.rim)
+        motion = car.step(-600.0, spoil_wheels=lambda w, shown=shown: shown)
+        assert motion.doubted == 0
+
+
+def test_wheels_that_come_late_in_a_skid_and_grip_again_have_not_jumped():
+    car = Car(15.0)
+    for _ in range(20):
+        car.step(0.0)
+    rim = shown = car.rim[0]
+    for k, turned in enumerate((-3.0, -3.0, -3.0, -3.0, 3.0, 3.0)):
+        rim += turned
+        shown = shown if k == 2 else rim
+        car.step(0.0 if k >= 3 else -350.0, wheels=lambda v, shown=shown: [shown] * 4)
+        assert car.state.motion.wheels_factor == 1.0
+
+
+def test_wheels_that_jump_apart_are_not_corrected_by_one_factor():
+    car = Car(9.0)
+    for _ in range(20):
+        car.step(0.0)
+    motion = car.step(0.0, spoil_wheels=lambda w: [0.7 * w[0], 0.7 * w[1], 0.85 * w[2], 0.85 * w[3]])
+    assert motion.doubted == 15
+    assert car.state.motion.wheels_factor == 1.0
+
+
+@pytest.mark.parametrize("sink", [2.0, 4.0])
+def test_wheels_that_all_begin_to_lock_in_one_step_have_not_jumped(sink):
+    """The brakes are pressed on ice: four alike lose what their torque takes, in every step."""
+    car = Car(15.0)
+    for _ in range(20):
+        car.step(0.0)
+    rim = car.rim[0]
+    for _ in range(4):
+        rim -= sink
+        motion = car.step(-1.1 * sink * INERTIA / DT, wheels=lambda v, rim=rim: [rim] * 4)
+    assert motion.doubted == 0
+    assert motion.wheel_speed_radps[0] == pytest.approx(rim + sink)
 
 
 @pytest.mark.parametrize("rate", [-5.0, 5.0])

@@ -44,10 +44,13 @@ ONE_WHEEL = st.one_of(
 
 @st.composite
 def faults(draw):
-    """A fault of one sensor, from before the braking or in the midst of it."""
+    """A fault of one sensor, or of what scales all wheels, from before the braking or in the midst of it."""
     at_s = draw(st.sampled_from((0.3, 1.5)))
-    if draw(st.booleans()):
+    which = draw(st.sampled_from(("speed", "wheel", "wheels")))
+    if which == "speed":
         return (wrong("vehicle_speed", *draw(SPEEDS), at_s),)
+    if which == "wheels":
+        return (wrong("wheels", "factor", draw(st.floats(0.75, 1.25)), at_s),)
     return (wrong(draw(st.sampled_from(SENSORS)), *draw(ONE_WHEEL), at_s),)
 
 
@@ -74,7 +77,7 @@ def it_brakes(speed_mps, power_w, friction, broken):
 DRAWN = given(st.floats(5.0, 40.0), st.floats(5e3, 60e3), st.sampled_from((0.5, 0.9)), faults())
 
 
-@settings(max_examples=12)
+@settings(max_examples=16)
 @DRAWN
 def test_no_single_wrong_sensor_takes_the_brakes(speed_mps, power_w, friction, broken):
     it_brakes(speed_mps, power_w, friction, broken)
