@@ -178,7 +178,6 @@ def test_wheels_on_topics_of_their_own_are_counted_however_slow_the_loop_is(conn
     before = len(states)
     car.stack.drive(inputs, lambda: len(states) > before + 40, "four seconds", 0.02)
     assert "comes at" not in car.running.text()
-    assert "held up" not in car.running.text()
 
     def slow() -> list[str]:
         return [line for line in car.running.text().splitlines() if "comes at" in line and "WARN" in line]
