@@ -180,6 +180,8 @@ def _matrix(table: Table, down: str) -> list[tuple[int, float, float, float]]:
     if title and len(title[-1][1]) > 1 and all(title[-1][1]):
         raise ConfigError(table.path, f"line {title[-1][0]}, column 2", f"{title[-1][1][1]!r} is no number")
     across = [table.number(first, text, f"column {i}") for i, text in enumerate(head[1:], 2) if text]
+    if down == "torque" and min(across, default=0.0) < 0.0:
+        raise ConfigError(table.path, f"line {first}", f"speed {min(across):g} is out of range", ">= 0")
     rows = []
     for line, cells in table.rows[len(title) + 1 :]:
         if len(cells) > len(across) + 1 and any(cells[len(across) + 1 :]):

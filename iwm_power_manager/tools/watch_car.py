@@ -170,6 +170,7 @@ class Feed:
 def in_words(values: Mapping[str, float]) -> list[str]:
     """Mode, gate, limits and missing inputs of a step, and its main numbers."""
     limits = binding_limits(int(values["limits"]), values["motor_factor"])
+    nothing = "nothing" if int(values["mode"]) == MODE_NORMAL else "nothing now"
     missing = [name for bit, name in STALE_NAMES.items() if int(values["stale"]) & bit]
     speed = f"speed {values['speed_mps']:.2f} m/s"
     if "vehicle_speed" in missing:
@@ -180,7 +181,7 @@ def in_words(values: Mapping[str, float]) -> list[str]:
         f"mode: {MODE_NAMES[int(values['mode'])]}",
         f"gate: {GATE_NAMES[int(values['gate'])]}",
         f"limits that bind: {', '.join(limits) or 'none'}",
-        f"missing: {', '.join(missing) or 'nothing'}",
+        f"missing: {', '.join(missing) or nothing}",
         speed,
         f"demand {values['power_demand_w'] / 1e3:.2f} kW",
         f"front share {values['front_share']:.2f}",

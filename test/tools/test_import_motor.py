@@ -139,6 +139,7 @@ def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys)
         ("T,1,2,3\n-5,0.1,0.2,0.3\n", (), "speed -5 is out of range (taken for a matrix"),
         ("T,1,2,3\n-5,0.1,0.2,0.3\n", (), "allowed: >= 0, or --down torque; for a list three columns: speed,"),
         ("T,1,2,3\n-5,0.1,0.2,0.3\n", ("--layout", "matrix"), "allowed: >= 0, or --down torque"),
+        ("T,-330,2,3\n5,0.1,0.2,0.3\n", ("--down", "torque"), "line 1: speed -330 is out of range (taken for a matrix"),
         ("torque_knm\\speed_rpm,1,2,3\n5,0.1,0.2,0.3\n", (), "'torque_knm\\\\speed_rpm': torques in another unit"),
         ("PK\x03\x04 no table at all\n", (), "holds no numbers; allowed: a text table"),
     ],
