@@ -186,6 +186,7 @@ def test_wheels_on_topics_of_their_own_are_counted_however_slow_the_loop_is(conn
     car.stack.drive(inputs, lambda: len(states) > before + 80, "four more seconds", 0.25)
     wheels = [line for line in slow() if "wheel_states" in line]
     assert len(wheels) <= 1, "one line for the four of them"
+    assert car.running.stop() == 0
 
 
 def test_topics_remapped_on_the_command_line_are_the_ones_that_are_watched(connect: Callable[..., Connected]) -> None:
