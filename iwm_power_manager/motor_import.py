@@ -25,6 +25,8 @@ _OTHER_UNITS = {
 _TORQUE, _SPEED = re.compile("torque|moment|n ?m", re.I), re.compile("speed|drehzahl|rpm|min|rad|omega", re.I)
 #: A map with so few of its grid's points is on no grid.
 _SPARSE = 0.25
+#: No car's motor has more, N m: those are speeds, or N mm.
+_MOST_NM = 5000.0
 
 
 class Points(NamedTuple):
@@ -99,6 +101,11 @@ def read_points(
         if key in points:
             raise ConfigError(path, f"line {line}", f"repeats speed {speed:g}, torque {torque:g}")
         points[key] = _efficiency(path, line, key, value / 100.0 if percent else value, quantity)
+    most_nm = max(abs(torque) for _, torque in points) / gear
+    if most_nm > _MOST_NM:
+        doubts.append(
+            f"torques up to {most_nm:g} N m at the motor: {'--down torque' if layout == 'matrix' else 'unit'}?"
+        )
     grid = len({speed for speed, _ in points}) * len({torque for _, torque in points})
     if len(points) < _SPARSE * grid:
         doubts.append(f"its points hardly lie on a grid: {len(points)} of {grid}")

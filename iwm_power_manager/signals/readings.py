@@ -260,7 +260,6 @@ class TopicReader:
     signals : that the topic carries
     sources : of these
     stamped : readings have the time of the message's header, else that given by the caller
-    unreadable : readings that stand for a message that cannot be read, for the checks to refuse and count
     """
 
     def __init__(
@@ -269,15 +268,15 @@ class TopicReader:
         self.signals = tuple(signals)
         self.sources = tuple(sources)
         self.stamped = reader.stamped
-        self.unreadable = tuple(reading for signal in dict.fromkeys(signals) if (reading := _unreadable(signal)))
         self.read = reader
 
     def __call__(self, data: bytes, time_ns: int) -> tuple[Reading, ...]:
-        """Readings of a message; `unreadable` if it is none of its type."""
+        """Readings of a message; if it is none of its type, or too short, what the checks refuse and count."""
         try:
             return self.read(data, time_ns)
         except UnreadableError:
-            return self.unreadable
+            every = (_unreadable(signal, time_ns) for signal in dict.fromkeys(self.signals))
+            return tuple(reading for reading in every if reading)
 
 
 def topic_readers(
@@ -460,16 +459,16 @@ def _bind_battery(places: Mapping[str, tuple[int, Callable[[float], float] | Non
     return battery
 
 
-def _unreadable(signal: str) -> Reading | None:
+def _unreadable(signal: str, time_ns: int) -> Reading | None:
     if signal == "speed":
-        return SpeedReading(_NEVER_NS, _NAN)
+        return SpeedReading(time_ns, _NAN)
     if signal == "wheel_speed":
-        return JointReading(_NEVER_NS, (), ())
+        return JointReading(time_ns, (), (_NAN,))
     if signal == "soc":
-        return BatteryReading(_NEVER_NS, _NAN, _NAN, _NAN, _NAN)
+        return BatteryReading(time_ns, _NAN, _NAN, _NAN, _NAN)
     if signal in DEMANDS or signal in PEDALS:
-        return DemandReading(_NEVER_NS, _NAN)
-    return FrictionReading(_NEVER_NS, _NAN) if signal == "friction" else None
+        return DemandReading(time_ns, _NAN)
+    return FrictionReading(time_ns, _NAN) if signal == "friction" else None
 
 
 def joint_state_reader(field: str) -> MessageReader[NamedValues]:

@@ -15,6 +15,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 
+from iwm_power_manager.control.inputs import Violation, check_names
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.pedals import (
@@ -205,6 +206,17 @@ def test_wheels_of_an_array_are_taken_in_order(tmp_path: Path) -> None:
     (found,) = quick(serialize_message(sent), 3)
     assert (found.stamp_ns, found.names) == (3, WHEEL_NAMES)
     assert found.values == pytest.approx(tuple(v / radius for v in (1.0, 2.0, 3.0, 4.0)))
+
+
+def test_an_array_that_is_too_short_is_refused_for_its_length_and_not_for_its_stamp(tmp_path: Path) -> None:
+    wanted = ", ".join(
+        f"{{topic: w, type: std_msgs/msg/Float32MultiArray, field: 'data[{i}]', unit: rpm}}" for i in range(4)
+    )
+    quick = read_from(tmp_path, f"  wheel_speed: [{wanted}]")["w"]
+    sent = messages.message_class("std_msgs/msg/Float32MultiArray")(data=[1.0, 2.0, 3.0])
+    (found,) = quick(serialize_message(sent), 12)
+    assert found.stamp_ns == 12
+    assert check_names(found.names, len(found.values), WHEEL_NAMES) is Violation.LENGTH
 
 
 def test_four_topics_make_one_reading_and_a_wheel_that_stays_away_is_missing(tmp_path: Path) -> None:

@@ -193,6 +193,13 @@ def test_points_on_no_grid_and_a_header_in_percent_are_warned_of(tmp_path, capsy
     assert "efficiencies as fractions of 1, although the header says %" in err
 
 
+def test_speeds_taken_for_torques_are_warned_of(tmp_path, capsys):
+    (tmp_path / "sheet.csv").write_text("Nm;1000;3000;6000;9000\n10;80;85;86;85\n30;82;87;88;86\n60;80;86;87;85\n")
+    code, _, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "map.csv")
+    assert code == 0
+    assert "torques up to 9000 N m at the motor: --down torque?" in err
+
+
 def test_a_unit_that_contradicts_the_header_is_warned_of(tmp_path, capsys):
     table = tmp_path / "sheet.csv"
     rows = "".join(f"{w * RPM:.8f},{t},{e:.8f}\n" for w, t, e in points())
