@@ -207,6 +207,8 @@ def unseen_summary(frontiers: Sequence[Frontier]) -> dict[str, Any]:
         "alone": len(alone),
         "alone_drawn": len(drawn),
         "busiest_minute": max(point.busiest_minute for _, point, _ in judged),
+        "part_above_10": sum(point.changes_per_min > 10.0 for _, point, _ in judged) / len(judged),
+        "most_changes_per_min": max(point.changes_per_min for _, point, _ in judged),
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in unseen.judge(frontiers)],
         "kinds": [kind._asdict() for kind in unseen.kinds(frontiers)],
         "with_rivals": _margins([cell[2] for cell in judged if _has_rival(cell[0])]),
@@ -259,7 +261,9 @@ def unseen_kinds(found: dict[str, Any]) -> str:
         f"{table}\n\n{found['cells'] - found['judged']} of {found['cells']} cells do not count: the trace was lost. In "
         f"{found['alone']} ({found['alone_drawn']} of them drawn cars) every rival changes more often, so that only "
         "equal split is left and the margin is our whole saving. Ours is at most "
-        f"{unseen.CLOSE:g} points behind in {100 * found['verdicts'][0]['part_close']:.1f} % of the cells."
+        f"{unseen.CLOSE:g} points behind in {100 * found['verdicts'][0]['part_close']:.1f} % of the cells. With a "
+        f"budget of 8, {100 * found['part_above_10']:.0f} % of the drives, which are short, have more than 10 changes "
+        f"a minute, at most {found['most_changes_per_min']:.1f}; the busiest minute has {found['busiest_minute']}."
     )
 
 
@@ -307,7 +311,6 @@ def unseen_worst(found: dict[str, Any]) -> str:
     return (
         "The worst cells, with the saving and the changes a minute of ours:\n\n"
         f"{markdown_table(found['worst'], worst)}\n\n"
-        f"The busiest minute of all had {found['busiest_minute']} changes.\n\n"
         f"By kind of cell, at most {unseen.CLOSE:g} behind when changes by more than 0.25, by more than 0.05, and all "
         f"moves are counted:\n\n{markdown_table(list(found['close_by_kind'].items()), kinds)}"
     )
