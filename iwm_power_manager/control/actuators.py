@@ -133,18 +133,13 @@ def judge(state: ActuatorState, reported_nm: Wheels, dt_s: float, limits: Actuat
     """
     if not state.recent:
         return state
-    ranges = [(min(torques), max(torques)) for torques in zip(*(c.torque_nm for c in state.recent), strict=True)]
-    reporting = state.reporting or any(
-        _follows(reported, *between, limits) for reported, between in zip(reported_nm, ranges, strict=True)
-    )
-    motors = state.motors
-    if reporting:
-        a, b, c, d = (
-            _judged(motor, reported, *between, dt_s, limits)
-            for motor, reported, between in zip(motors, reported_nm, ranges, strict=True)
-        )
-        motors = (a, b, c, d)
-    return state._replace(motors=motors, reporting=reporting)
+    sent = zip(*[torque_nm for _, torque_nm in state.recent], strict=True)
+    reports = [(reported, min(one), max(one)) for reported, one in zip(reported_nm, sent, strict=True)]
+    reporting = state.reporting or any(_follows(*report, limits) for report in reports)
+    if not reporting:
+        return state
+    a, b, c, d = (_judged(motor, *report, dt_s, limits) for motor, report in zip(state.motors, reports, strict=True))
+    return ActuatorState((a, b, c, d), state.recent, True)
 
 
 def _tolerance_nm(least_nm: float, most_nm: float, limits: ActuatorLimits) -> float:

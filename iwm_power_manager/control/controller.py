@@ -17,7 +17,7 @@ from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import InputLimits, InputMonitor
 from iwm_power_manager.control.motion import DOUBT_SPEED
 from iwm_power_manager.control.record import Watch, to_numbers
-from iwm_power_manager.control.repeat import advance
+from iwm_power_manager.control.repeat import advance, battery_limits
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.supervision import (
     LOCKSTEP_SUPERVISION,
@@ -32,7 +32,6 @@ from iwm_power_manager.control.supervision import (
 from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import Command, ControllerState, Measurement, Wheels, initial_state
 from iwm_power_manager.held import Held
-from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.model.parameters import VehicleParams
 
 #: While a wheel is lost, slip is judged this much more strictly: its axle is watched through one wheel only.
@@ -198,7 +197,7 @@ class Controller:
         elif supervision.stale & STALE_WHEELS and not supervision.stale & STALE_SPEED:
             wheels = (speed / radius,) * 4
         demand = shape_demand(monitor.demand_w, monitor.demand_speed_mps, speed, supervision)
-        discharge, charge = battery_limits_w(monitor.soc, monitor.temperature_c, self._vehicle.battery)
+        discharge, charge = battery_limits(monitor.soc, monitor.temperature_c, self._held_vehicle)
         factor = supervision.motor_factor
         return Measurement(
             speed_mps=speed,

@@ -13,12 +13,19 @@ from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import Command, ControllerState, Measurement
 from iwm_power_manager.held import Held
 from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.limits import battery_limits_w
 from iwm_power_manager.model.parameters import VehicleParams
 
 FloatArray = NDArray[np.float64]
 
 _decided = kernel(decided)
 _measurement = kernel(measurement_of)
+
+
+@kernel
+def battery_limits(soc: float, temperature_degc: float, vehicle: Held[VehicleParams]) -> tuple[float, float]:
+    """Electrical power the car's battery may give and take, W (`limits.battery_limits_w`)."""
+    return battery_limits_w(soc, temperature_degc, vehicle.value.battery)
 
 
 @kernel

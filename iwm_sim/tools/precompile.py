@@ -34,7 +34,7 @@ def jobs() -> Iterator[Job]:
     import numpy as np
 
     from iwm_power_manager.control.record import DECIDED_NAMES, SIGNALS
-    from iwm_power_manager.control.repeat import advance, repeat
+    from iwm_power_manager.control.repeat import advance, battery_limits, repeat
     from iwm_power_manager.control.settings import default_settings
     from iwm_power_manager.control.thresholds import Thresholds, for_car
     from iwm_power_manager.control.types import Measurement, initial_state
@@ -62,6 +62,7 @@ def jobs() -> Iterator[Job]:
         discharge, charge = battery_limits_w(0.8, 25.0, vehicle.params.battery)
         measurement = Measurement(1.0, (3.0, 3.0, 3.0, 3.0), 500.0, 0.01, 0.9, discharge, charge, 0.8)
         before, after, car = Held(initial_state()), Held(initial_state()), Held(vehicle.params)
+        battery_limits(0.8, 25.0, car)
         advance(measurement, before, after, settings, car, table)
         steps = np.zeros((0, len(SIGNALS)))
         repeat(steps, initial_state(), settings, vehicle.params, table, np.zeros((0, len(DECIDED_NAMES))))
