@@ -101,7 +101,7 @@ def read_points(
         if key in points:
             raise ConfigError(path, f"line {line}", f"repeats speed {speed:g}, torque {torque:g}")
         points[key] = _efficiency(path, line, key, value / 100.0 if percent else value, quantity)
-    most_nm = max(abs(torque) for _, torque in points) / gear
+    most_nm = max((abs(torque) for _, torque in points), default=0.0) / gear
     if most_nm > _MOST_NM:
         doubts.append(
             f"torques up to {most_nm:g} N m at the motor: {'--down torque' if layout == 'matrix' else 'unit'}?"
