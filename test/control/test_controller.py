@@ -351,6 +351,16 @@ class TestRecord:
         assert drive.controller.state == initial_state()
         assert drive.step()["stale"] != 0
 
+    def test_reset_forgets_the_friction_that_was_estimated(self, drive) -> None:
+        controller = drive.controller
+        controller.table_of = lambda _friction: empty_table()
+        controller.settings = controller.settings._replace(friction_prior=0.5)
+        assert drive.run(3)["friction"] == 0.5
+        controller.settings = controller.settings._replace(friction_prior=0.8)
+        assert drive.run(1)["friction"] == 0.5
+        controller.reset()
+        assert drive.run(1)["friction"] == 0.8
+
     def test_settings_come_back_with_the_types_the_law_was_compiled_for(self, drive) -> None:
         settings_again = from_numbers(list(drive.run(1).values())).settings
         assert settings_again == default_settings("equal")
