@@ -205,6 +205,15 @@ class TestMissingInputs:
         assert values["speed_mps"] == 10.0
         assert [values[f"{wheel}_speed_radps"] for wheel in NAMES] == [10.0 / RADIUS] * 4
 
+    @pytest.mark.parametrize("part", [0.6, 0.8, 0.9])
+    def test_with_both_lost_in_a_skid_slip_soon_limits_no_braking(self, drive, part) -> None:
+        """What is held is a skid of which nobody can say whether it has ended."""
+        drive.run(60)
+        drive.run(5, demand=-20e3, wheels=(part * 10.0 / RADIUS,) * 4)
+        values = drive.run(40, demand=-20e3, without=("wheels", "speed"))
+        assert values["gated_wheels"] == 0
+        assert sum(friction(values)) * 10.0 / RADIUS <= -19e3
+
     def test_a_stale_brake_demand_is_let_go_slowly_and_never_drives(self, drive) -> None:
         drive.run(60, demand=-8000.0)
         after = [drive.run(1, without=("demand",)) for _ in range(230)]

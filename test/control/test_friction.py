@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iwm_power_manager.control import law
 from iwm_power_manager.control.friction import estimate
 from iwm_power_manager.control.settings import default_settings
-from iwm_power_manager.control.types import initial_state
+from iwm_power_manager.control.table import empty_table
+from iwm_power_manager.control.types import FrictionState, Measurement, SideGrip, initial_state
 from iwm_power_manager.model.tyre import slip_at_friction
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -28,6 +30,7 @@ UNLIKE = CAR._replace(
     chassis=CAR.chassis._replace(front_axle_to_cg_m=0.8, rear_axle_to_cg_m=1.6),
 )
 SETTINGS = default_settings()
+TABLE = empty_table()
 DT = 0.01
 
 
@@ -233,7 +236,8 @@ def test_at_rest_it_goes_back_to_the_prior_slowly():
         grip = drive.step((0.2,) * 4, 0.0)
     assert first < grip.left.friction < first + 0.2
     assert grip.left.confidence < 0.95
-    for _ in range(30000):
+    drive.settings = SETTINGS._replace(friction_return_s=SETTINGS.friction_return_s / 20.0)
+    for _ in range(1500):
         grip = drive.step((0.2,) * 4, 0.0)
     assert grip.left.friction == pytest.approx(SETTINGS.friction_prior, abs=0.02)
     assert grip.left.confidence < 0.05
@@ -282,3 +286,25 @@ def test_the_oracles_slip_is_the_one_the_drive_is_made_of():
     assert friction_coefficient(slip(wheels[0], speed, RADIUS, 0.5), 0.5, CAR.front.tyre) == pytest.approx(
         -0.2, rel=1e-9
     )
+
+
+@given(
+    st.tuples(*[st.floats(0.05, 1.2)] * 4),
+    st.floats(-60e3, 60e3),
+    st.sampled_from([1.0, 5.0, 20.0]),
+    st.tuples(*[st.floats(0.6, 1.4)] * 4),
+)
+def test_it_decides_which_policy_a_strategy_uses_and_nothing_else(frictions, demand, speed, rims):
+    """Gate, slip limiter and brakes go by slip and road force alone: a strategy that asks for none gets the same."""
+    left, right, assumed, told = frictions
+    wheels = tuple(rim * speed / RADIUS for rim in rims)
+    start = initial_state()._replace(steps=1)
+    start = start._replace(motion=start.motion._replace(speed_mps=speed, shown_mps=speed))
+
+    def torques(state, friction):
+        m = Measurement(speed, wheels, demand, DT, friction, 47.5e3, 47.5e3, 0.6)
+        command, _ = law.step(m, state, default_settings("equal"), CAR, TABLE)
+        return command.motor_torque_nm, command.friction_torque_nm, command.gated_wheels, command.limits
+
+    known = FrictionState(SideGrip(left, 1.0), SideGrip(right, 1.0), start.friction.wheels, assumed)
+    assert torques(start._replace(friction=known), told) == torques(start, 0.9)
