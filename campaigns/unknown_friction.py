@@ -101,7 +101,7 @@ def jump(name: str, speed_mps: float, demand: Demand) -> Scenario:
         speed_mps=speed_mps,
         demand=(demand,),
         friction=(Friction(0.0, *before), Friction(JUMP_S * speed_mps, *after)),
-        told_friction=min(before),
+        assumed_friction=min(before),
         duration_s=_LONGEST_S[demand.kind],
         to_standstill=True,
         steering=None,
@@ -116,7 +116,7 @@ def all_jumps() -> list[Scenario]:
 
 def jumped(scenario: Scenario) -> Jumped:
     """Drive a jump twice and compare."""
-    told, estimated = (_figures(drive_scenario(scenario, told=told), scenario) for told in (True, False))
+    told, estimated = (_figures(drive_scenario(scenario, friction_known=known), scenario) for known in (True, False))
     return Jumped(scenario, told, estimated)
 
 

@@ -31,7 +31,7 @@ class Held[Value]:
             from iwm_power_manager import held_type
 
             self._numba_type_ = held_type.of(value)
-            self._buffer, self.address = held_type.room_for(self._numba_type_)
+            self._buffer, self.address = held_type.memory_for(self._numba_type_)
         self.value = value
 
     @property

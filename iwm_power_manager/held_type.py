@@ -37,11 +37,11 @@ def of(value: Any) -> HeldType:
     return HeldType(numba.typeof(value))
 
 
-def room_for(held: HeldType) -> tuple[bytearray, int]:
+def memory_for(held: HeldType) -> tuple[bytearray, int]:
     """Memory for a value, and its address; the memory must not grow."""
     context = cpu_target.target_context
-    room = bytearray(context.get_abi_sizeof(context.get_value_type(held.kind)))
-    return room, ctypes.addressof(ctypes.c_char.from_buffer(room))
+    memory = bytearray(context.get_abi_sizeof(context.get_value_type(held.kind)))
+    return memory, ctypes.addressof(ctypes.c_char.from_buffer(memory))
 
 
 @infer_getattr

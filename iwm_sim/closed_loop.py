@@ -361,7 +361,7 @@ class Progress(NamedTuple):
     steps: int
     car: plant.PlantState
     controller: ControllerState
-    foot: DriverState
+    driver: DriverState
 
 
 @kernel
@@ -382,7 +382,7 @@ def _loop(
 ) -> Progress:
     """Steps to the end of the trace; or, where the friction is estimated, until another one is to be assumed."""
     road = (friction, friction, friction, friction)
-    car, controller, foot = at.car, at.controller, at.foot
+    car, controller, driver = at.car, at.controller, at.driver
     steps = at.steps
     for k in range(at.steps, trace.speed_mps.size):
         speed_error = 0.0
@@ -391,8 +391,8 @@ def _loop(
             speed_error = noise.speed_mps[k]
             e = noise.wheel_radps[k]
             wheel_error = (e[0], e[1], e[2], e[3])
-        pedals, foot = drive(
-            foot,
+        pedals, driver = drive(
+            driver,
             car.speed_mps,
             trace.speed_mps[k],
             trace.ahead_mps[k],
@@ -416,4 +416,4 @@ def _loop(
         steps = k + 1
         if estimated and controller.friction.assumed != assumed_friction:
             break
-    return Progress(steps, car, controller, foot)
+    return Progress(steps, car, controller, driver)

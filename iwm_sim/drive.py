@@ -111,7 +111,7 @@ class Drive:
         self._faults = Faults(scenario.faults)
         self._hands = LaneKeeper(self._believed, dt_s) if scenario.steering is None else None
         self.car = plant.initial_plant(self._params, scenario.soc, scenario.speed_mps)
-        self._foot = DriverState(0.0)
+        self._driver = DriverState(0.0)
         self._pedals: Pedals | None = None
         self.step = 0
         self._warm()
@@ -281,8 +281,8 @@ class Drive:
         """What the driver does who follows the trace."""
         k, trace = self.step, self._trace
         assert trace is not None
-        pedals, self._foot = drive(
-            self._foot,
+        pedals, self._driver = drive(
+            self._driver,
             self.car.speed_mps,
             trace.speed_mps[k],
             trace.ahead_mps[k],
@@ -311,12 +311,12 @@ class Drive:
 
     def _warm(self) -> None:
         """Compile every kernel now and not in the first steps."""
-        state, foot, hands = self.car, self._foot, self._hands
+        state, driver, hands = self.car, self._driver, self._hands
         none = (0.0, 0.0, 0.0, 0.0)
         self._hands = None if hands is None else LaneKeeper(self._believed, self._dt_s)
         self.sense()
         self.advance(none, self.pedal_brake_torque_nm())
-        self.car, self._foot, self._hands, self._pedals, self.step = state, foot, hands, None, 0
+        self.car, self._driver, self._hands, self._pedals, self.step = state, driver, hands, None, 0
         self._faults = Faults(self.scenario.faults)
 
 

@@ -71,7 +71,7 @@ def controller_of(scenario: Scenario, settings: Settings | None = None, policies
     if scenario.foreign_brakes:
         params = params.with_axles(friction_brake=params.front.friction_brake._replace(max_torque_nm=0.0))
     thresholds = for_car(Thresholds(), params)
-    prior = scenario.told_friction
+    prior = scenario.assumed_friction
     settings = (settings or default_settings())._replace(friction_prior=prior)
     limits = ControllerLimits(
         inputs=input_limits(thresholds, params.front.wheel.radius_m, by_clock=True),
@@ -113,7 +113,7 @@ def drive_scenario(
     scenario: Scenario,
     controller: Controller | None = None,
     *,
-    told: bool = False,
+    friction_known: bool = False,
     dt_s: float = 0.01,
     substeps: int = 2,
 ) -> Run:
@@ -122,12 +122,12 @@ def drive_scenario(
     Parameters
     ----------
     controller : the power manager; None: as the node starts it
-    told : it estimates no friction, but is told the road's in each step
+    friction_known : it estimates no friction, but knows the road's in each step
     dt_s, substeps : control step, and plant steps in each
     """
     manager = controller or controller_of(scenario)
     table_of = manager.table_of
-    if told:
+    if friction_known:
         manager.table_of = None
     drive = Drive(scenario, dt_s=dt_s, substeps=substeps)
     period_ns = round(dt_s * _NS_PER_S)
@@ -139,7 +139,7 @@ def drive_scenario(
         now_ns += period_ns
     while not drive.finished:
         give(manager, drive.sense(), drive, now_ns)
-        if told and table_of is not None and manager.friction != min(drive.friction):
+        if friction_known and table_of is not None and manager.friction != min(drive.friction):
             manager.friction = min(drive.friction)
             manager.policy = table_of(manager.friction)
         command = manager.step(now_ns, dt_s).command

@@ -15,7 +15,7 @@
       friction: 0.9                           # a number, or a list of from_m, left, right (or friction)
       grade: 0.0                              # a number, or a list of from_m, grade
       headwind_mps: 0.0
-    told_friction: 0.9                        # what the power manager is told; optional: the road's at its start
+    assumed_friction: 0.9                     # what the power manager is told; optional: the road's at its start
     until: {time_s: 30.0, standstill: true}   # the end; standstill needs a time as well
     foreign_brakes:                           # of another system; the power manager has no friction brakes then
       - {from_s: 2.0, braking_mps2: 6.0}
@@ -64,7 +64,7 @@ _KEYS = (
     "demand",
     "steering",
     "direction",
-    "told_friction",
+    "assumed_friction",
     "until",
     "foreign_brakes",
     "imu",
@@ -134,7 +134,7 @@ class Scenario:
     friction: tuple[Friction, ...] = (Friction(0.0, 0.9, 0.9),)
     grade: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
     headwind_mps: float = 0.0
-    told_friction: float = 0.9
+    assumed_friction: float = 0.9
     speed_mps: float = 0.0
     soc: float = 0.8
     to_standstill: bool = False
@@ -156,7 +156,7 @@ def on_cycle(vehicle: Vehicle, cycle: Cycle, friction: float, soc: float = 0.8, 
         duration_s=min(cycle.duration_s, until_s),
         cycle=cycle,
         friction=(Friction(0.0, friction, friction),),
-        told_friction=friction,
+        assumed_friction=friction,
         speed_mps=float(cycle.speed_mps[0]),
         soc=soc,
         described=f"{vehicle.name} on {cycle.name}, friction {friction:g}, idle drive {vehicle.idle_drive}",
@@ -196,7 +196,7 @@ def load_scenario(name: Path | str, idle_drive: str | None = None, vehicle: Vehi
     if not isinstance(about, str) or not about.strip():
         raise ConfigError(path, "about", f"{about!r} is no sentence", "text that is not empty")
     direction = files.check_choice(path, "direction", content.get("direction", "forward"), DIRECTIONS)
-    told = content.get("told_friction", min(friction[0].left, friction[0].right))
+    told = content.get("assumed_friction", min(friction[0].left, friction[0].right))
     return Scenario(
         name=path.stem,
         vehicle=vehicle,
@@ -209,7 +209,7 @@ def load_scenario(name: Path | str, idle_drive: str | None = None, vehicle: Vehi
         friction=friction,
         grade=_grade(path, road.get("grade", 0.0)),
         headwind_mps=files.check_number(path, "road.headwind_mps", road.get("headwind_mps", 0.0), -60.0, 60.0),
-        told_friction=files.check_number(path, "told_friction", told, 0.05, 1.5),
+        assumed_friction=files.check_number(path, "assumed_friction", told, 0.05, 1.5),
         speed_mps=files.check_number(path, "start.speed_mps", start.get("speed_mps", first), -20.0, 70.0, unit="m/s"),
         soc=files.check_number(path, "start.soc", start.get("soc", 0.8), 0.0, 1.0),
         to_standstill=to_standstill,

@@ -33,8 +33,8 @@ from iwm_power_manager.control.slip import (
     UNLIMITED_NM,
     filtered,
     gained_radps,
+    limiter_torque_nm,
     road_torque_nm,
-    torque_room_nm,
     worse_slip,
 )
 from iwm_power_manager.control.split import split
@@ -194,7 +194,7 @@ def _wheel(
         )
     grip = UNLIMITED_NM
     if gate_mode == GATE_MODE_LIMITER:
-        grip = torque_room_nm(
+        grip = limiter_torque_nm(
             braking,
             road,
             wheel_speed_radps,
@@ -223,20 +223,20 @@ def _wheel(
 
 
 @kernel
-def _room_nm(wheel: Wheel) -> float:
+def _capacity_nm(wheel: Wheel) -> float:
     return 0.0 if wheel.gated else min(wheel.actuator_nm, wheel.grip_nm)
 
 
 @kernel
-def _rooms_nm(left: Wheel, right: Wheel, moments_nm: tuple[float, float], axle: Axle) -> tuple[float, float]:
-    """Room of an axle's two wheels within its yaw budget: the moments that more torque left, and right, may have.
+def _capacities_nm(left: Wheel, right: Wheel, moments_nm: tuple[float, float], axle: Axle) -> tuple[float, float]:
+    """Capacity of an axle's two wheels within its yaw budget: the moments that more torque left, and right, may have.
 
     The moment of a difference of torques T is T / radius * track / 2.
     """
-    left_room, right_room = _room_nm(left), _room_nm(right)
+    left_capacity, right_capacity = _capacity_nm(left), _capacity_nm(right)
     per_moment = 2.0 * axle.wheel.radius_m / axle.track_width_m
     left_more, right_more = per_moment * moments_nm[0], per_moment * moments_nm[1]
-    return min(left_room, right_room + left_more), min(right_room, left_room + right_more)
+    return min(left_capacity, right_capacity + left_more), min(right_capacity, left_capacity + right_more)
 
 
 @kernel
@@ -245,9 +245,9 @@ def _unequal_s(before_s: float, left: Wheel, right: Wheel, wanted: bool, dt_s: f
 
     What was steered for one side is nothing for the other: the time goes back through zero.
     """
-    left_room, right_room = _room_nm(left), _room_nm(right)
-    if wanted and abs(left_room - right_room) > UNEQUAL_PART * max(left_room, right_room):
-        return before_s + dt_s if left_room > right_room else before_s - dt_s
+    left_capacity, right_capacity = _capacity_nm(left), _capacity_nm(right)
+    if wanted and abs(left_capacity - right_capacity) > UNEQUAL_PART * max(left_capacity, right_capacity):
+        return before_s + dt_s if left_capacity > right_capacity else before_s - dt_s
     left_over = max(abs(before_s) - dt_s, 0.0)
     return left_over if before_s > 0.0 else -left_over
 
@@ -366,8 +366,8 @@ class Pair(NamedTuple):
 
     left: Wheel
     right: Wheel
-    left_room_nm: float
-    right_room_nm: float
+    left_capacity_nm: float
+    right_capacity_nm: float
     alike: bool
 
 
@@ -444,13 +444,13 @@ def _pair(
             w[k + 1], slips[k + 1], right_gate, speed_mps, demand, gain[k + 1], lower_part, gate_mode, targets[k + 1],
             dt, first, before[k + 1], w[k], before[k], axle, settings, vehicle,
         )  # fmt: skip
-    left_room, right_room = _rooms_nm(left, right, moments_nm, axle)
-    return Pair(left, right, left_room, right_room, alike)
+    left_capacity, right_capacity = _capacities_nm(left, right, moments_nm, axle)
+    return Pair(left, right, left_capacity, right_capacity, alike)
 
 
 @kernel
-def _pair_room_w(pair: Pair) -> float:
-    return pair.left.conversion_radps * pair.left_room_nm + pair.right.conversion_radps * pair.right_room_nm
+def _pair_capacity_w(pair: Pair) -> float:
+    return pair.left.conversion_radps * pair.left_capacity_nm + pair.right.conversion_radps * pair.right_capacity_nm
 
 
 @kernel
@@ -468,7 +468,7 @@ def _shared(
     """Steps 5 and 6 for an axle."""
     sign = -1.0 if braking else 1.0
     left_nm, right_nm = between_wheels(
-        given_w, pair.left.conversion_radps, pair.right.conversion_radps, pair.left_room_nm, pair.right_room_nm
+        given_w, pair.left.conversion_radps, pair.right.conversion_radps, pair.left_capacity_nm, pair.right_capacity_nm
     )
     left = _given(sign * left_nm, pair.left, speed_mps, braking, dt_s, left_before, settings, axle)
     right = left
@@ -622,7 +622,7 @@ def _commanded(
     rear_gated = rear.left.gated and rear.right.gated
     front_power, rear_power = gated_split(demand, memory.applied_share, front_gated, rear_gated)
     front_asked, rear_asked = abs(front_power), abs(rear_power)
-    front_given, rear_given = allocate(front_asked, rear_asked, _pair_room_w(front), _pair_room_w(rear))
+    front_given, rear_given = allocate(front_asked, rear_asked, _pair_capacity_w(front), _pair_capacity_w(rear))
 
     # 5. torque, 6. slew
     f = _shared(front_given, front, speed_mps, braking, dt, fl0, fr0, settings, vehicle.front)

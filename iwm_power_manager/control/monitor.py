@@ -269,7 +269,7 @@ class InputMonitor:
         if violation in _REFUSED_BY_ANOTHER and self._outlasts(
             SPEED, reading.stamp_ns, reading.speed_mps, self._limits.speed, self._limits.rival_s
         ):
-            told = self._told_by_wheels(reading.stamp_ns)
+            told = self._shown_by_wheels(reading.stamp_ns)
             farther = abs(reading.speed_mps - told) >= abs(self.speed_mps - told)  # never so where nobody tells
             violation = violation if farther else self._believe_rival(SPEED)
         if tally.note(violation, reading.stamp_ns):
@@ -406,7 +406,7 @@ class InputMonitor:
         del self._rivals[topic]
         return Violation.NONE
 
-    def _told_by_wheels(self, stamp_ns: int) -> float:
+    def _shown_by_wheels(self, stamp_ns: int) -> float:
         """Speed of the car by its two middle wheels; NaN if they have not come of late."""
         if self.tallies[WHEELS].age_s(stamp_ns) > self._limits.rival_s:
             return math.nan

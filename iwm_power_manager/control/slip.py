@@ -15,7 +15,7 @@ from iwm_power_manager.jit import kernel
 #: The limiter never steers to less than this slip speed, m/s: at walking pace a slip of 0.15 is within the noise.
 LEAST_SLIP_SPEED_MPS = 0.3
 
-#: Room where the limiter has no say, N m: more than any wheel can be asked for.
+#: Torque where the limiter has no say, N m: more than any wheel can be asked for.
 UNLIMITED_NM = 1e9
 
 
@@ -51,7 +51,7 @@ def road_torque_nm(applied_nm: float, gained_radps: float, dt_s: float, inertia:
 
 
 @kernel
-def torque_room_nm(
+def limiter_torque_nm(
     braking: bool,
     road_nm: float,
     wheel_speed_radps: float,

@@ -143,11 +143,11 @@ def cycle_source(cycle: Cycle, dt_s: float, vehicle: VehicleParams, weight: floa
 @kernel
 def _driven(trace: Trace, dt_s, vehicle, power_w, speed_mps):
     mass = equivalent_mass_kg(vehicle)
-    foot = DriverState(0.0)
+    driver_state = DriverState(0.0)
     speed = trace.speed_mps[0]
     for k in range(power_w.size):
-        pedals, foot = drive(
-            foot,
+        pedals, driver_state = drive(
+            driver_state,
             speed,
             trace.speed_mps[k],
             trace.ahead_mps[k],

@@ -77,7 +77,7 @@ class Axles(NamedTuple):
     front_radps, rear_radps : of a rolling wheel
     front_load_n, rear_load_n : of a wheel
     front_grip_n, rear_grip_n : largest force that the tyres of the axle carry
-    front_room_n, rear_room_n : and that its motors give with it
+    front_capacity_n, rear_capacity_n : and that its motors give with it
     """
 
     front_radps: float
@@ -86,8 +86,8 @@ class Axles(NamedTuple):
     rear_load_n: float
     front_grip_n: float
     rear_grip_n: float
-    front_room_n: float
-    rear_room_n: float
+    front_capacity_n: float
+    rear_capacity_n: float
 
 
 @kernel
@@ -103,11 +103,15 @@ def axles_of(force_n: float, speed_mps: float, friction: float, slip_aware: bool
         grip = 2.0 * USABLE_FRICTION * friction
         front_grip = grip * peak_ratio(front.tyre) * front_load
         rear_grip = grip * peak_ratio(rear.tyre) * rear_load
-    front_room, rear_room = front_grip, rear_grip
+    front_capacity, rear_capacity = front_grip, rear_grip
     if force_n > 0.0:
-        front_room = min(front_room, 2.0 * torque_limit_nm(front_rolling, 0.0, front.motor) / front.wheel.radius_m)
-        rear_room = min(rear_room, 2.0 * torque_limit_nm(rear_rolling, 0.0, rear.motor) / rear.wheel.radius_m)
-    return Axles(front_rolling, rear_rolling, front_load, rear_load, front_grip, rear_grip, front_room, rear_room)
+        front_capacity = min(
+            front_capacity, 2.0 * torque_limit_nm(front_rolling, 0.0, front.motor) / front.wheel.radius_m
+        )
+        rear_capacity = min(rear_capacity, 2.0 * torque_limit_nm(rear_rolling, 0.0, rear.motor) / rear.wheel.radius_m)
+    return Axles(
+        front_rolling, rear_rolling, front_load, rear_load, front_grip, rear_grip, front_capacity, rear_capacity
+    )
 
 
 @kernel
@@ -157,17 +161,17 @@ def split_outcome_w(
         return chemical_power_w(2.0 * idle_w, vehicle.battery), 0.0, 0.0
     sign = 1.0 if force_n > 0.0 else -1.0
     # An idle axle's drag is a force too; the working axle has to overcome it. One that has to help is not idle.
-    if front == 0.0 and sign * rear <= axles.rear_room_n:
+    if front == 0.0 and sign * rear <= axles.rear_capacity_n:
         rear += 2.0 * idle_drag_nm(0.0, axles.front_radps, front_motor) / vehicle.front.wheel.radius_m
-    elif rear == 0.0 and sign * front <= axles.front_room_n:
+    elif rear == 0.0 and sign * front <= axles.front_capacity_n:
         front += 2.0 * idle_drag_nm(0.0, axles.rear_radps, rear_motor) / vehicle.rear.wheel.radius_m
     need_front = max(sign * front, 0.0)
     need_rear = max(sign * rear, 0.0)
 
     over = max(need_front - axles.front_grip_n, 0.0) + max(need_rear - axles.rear_grip_n, 0.0)
-    given_front = min(need_front, axles.front_room_n)
-    given_rear = min(need_rear + need_front - given_front, axles.rear_room_n)
-    given_front = min(need_front + need_rear - given_rear, axles.front_room_n)
+    given_front = min(need_front, axles.front_capacity_n)
+    given_rear = min(need_rear + need_front - given_front, axles.rear_capacity_n)
+    given_front = min(need_front + need_rear - given_rear, axles.front_capacity_n)
     missing = need_front + need_rear - given_front - given_rear
 
     front_n, rear_n = sign * given_front, sign * given_rear

@@ -23,11 +23,11 @@ def conversion_speed_radps(
 
 
 @kernel
-def allocate(front: float, rear: float, front_room: float, rear_room: float) -> tuple[float, float]:
-    """Give each axle what it asks for; what one has no room for goes to the other (all >= 0, in W)."""
-    front_given = min(front, front_room)
-    rear_given = min(rear + front - front_given, rear_room)
-    front_given = min(front + rear - rear_given, front_room)
+def allocate(front: float, rear: float, front_capacity: float, rear_capacity: float) -> tuple[float, float]:
+    """Give each axle what it asks for; what one cannot take goes to the other (all >= 0, in W)."""
+    front_given = min(front, front_capacity)
+    rear_given = min(rear + front - front_given, rear_capacity)
+    front_given = min(front + rear - rear_given, front_capacity)
     return front_given, max(rear_given, 0.0)
 
 
@@ -36,19 +36,19 @@ def between_wheels(
     given_w: float,
     left_conversion_radps: float,
     right_conversion_radps: float,
-    left_room_nm: float,
-    right_room_nm: float,
+    left_capacity_nm: float,
+    right_capacity_nm: float,
 ) -> tuple[float, float]:
-    """Torques of an axle's two wheels, N m >= 0, for a power of the axle: equal, where both have room for it.
+    """Torques of an axle's two wheels, N m >= 0, for a power of the axle: equal, where both can take it.
 
-    A wheel that has less room gives what it can, the other one the rest.
+    A wheel that can take less gives what it can, the other one the rest.
     """
     equal = given_w / (left_conversion_radps + right_conversion_radps)
-    if left_room_nm == right_room_nm or equal <= min(left_room_nm, right_room_nm):
+    if left_capacity_nm == right_capacity_nm or equal <= min(left_capacity_nm, right_capacity_nm):
         return equal, equal
-    if left_room_nm < right_room_nm:
-        return left_room_nm, max(given_w - left_room_nm * left_conversion_radps, 0.0) / right_conversion_radps
-    return max(given_w - right_room_nm * right_conversion_radps, 0.0) / left_conversion_radps, right_room_nm
+    if left_capacity_nm < right_capacity_nm:
+        return left_capacity_nm, max(given_w - left_capacity_nm * left_conversion_radps, 0.0) / right_conversion_radps
+    return max(given_w - right_capacity_nm * right_conversion_radps, 0.0) / left_conversion_radps, right_capacity_nm
 
 
 @kernel

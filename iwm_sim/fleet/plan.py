@@ -113,7 +113,7 @@ def plan_of(file: str, content: Mapping[str, Any]) -> Plan:
         return Drive(tuple(made))
 
     def road(car: Car, scenario: str, strategy: str) -> tuple[Road, Solve | None]:
-        told = load_scenario(scenario, vehicle=car.load()).told_friction
+        told = load_scenario(scenario, vehicle=car.load()).assumed_friction
         solve = Solve(car, told, grid) if strategy in POLICY_STRATEGIES else None
         return Road(scenario, car, strategy, solve.file if solve else ""), solve
 

@@ -127,7 +127,7 @@ class Case:
         return f"{self.switching_cost_j:g} J a move{fixed}"
 
     @property
-    def told_friction(self) -> float:
+    def law_friction(self) -> float:
         """Friction the law assumes."""
         return self.friction if self.assumed_friction is None else self.assumed_friction
 
@@ -263,7 +263,7 @@ def known_in_advance(case: Case, vehicle: Vehicle, until_s: float = np.inf) -> t
         case.dt_s,
         case.settings.decision_period_s,
         vehicle.params,
-        case.told_friction,
+        case.law_friction,
         share,
     )
     if case.changes_per_min > 0.0:

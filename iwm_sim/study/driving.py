@@ -52,7 +52,7 @@ def with_rules(wanted: Sequence[Case], jobs: int) -> list[Case]:
 def _rule_key(case: Case) -> tuple[Any, ...] | None:
     if case.strategy != "rule":
         return None
-    return case.vehicle, case.idle_drive, case.car, case.told_friction, case.dt_s, case.substeps, case.soc
+    return case.vehicle, case.idle_drive, case.car, case.law_friction, case.dt_s, case.substeps, case.soc
 
 
 def drive_all(

@@ -203,7 +203,7 @@ def robustness(base: Case, policies: Policies) -> list[tuple[str, Case]]:
     variants["noise 0.1 m/s, 0.3 rad/s"] = replace(base, noise=SensorNoise(0.1, 0.3))
     made = []
     for name, case in variants.items():
-        policy = policies.ours(base.idle_drive, case.told_friction)
+        policy = policies.ours(base.idle_drive, case.law_friction)
         made.append((name, replace(case, label=labels.ED)))
         made.append((name, replace(case, strategy=STRATEGY, label=labels.OURS, policy=policy)))
     return made

@@ -192,7 +192,7 @@ def _made_with(case: Case) -> dict[str, Any]:
     policy = policy_of(case.policy) if case.policy else None
     vehicle = vehicle_of(case.vehicle, case.idle_drive, case.car)
     return {
-        "assumed_friction": "estimated" if case.policies else case.told_friction,
+        "assumed_friction": "estimated" if case.policies else case.law_friction,
         "dt_s": case.dt_s,
         "initial_soc": case.soc,
         "noise": case.noise._asdict(),

@@ -57,7 +57,7 @@ def run(plan: Plan) -> int:
 def run_scenario(plan: Plan) -> int:
     """Drive a scenario over DDS and say what it requires; the exit code is `FAILED` if that or the bag falls short."""
     scenario = load_scenario(plan.scenario, plan.idle_drive or None)
-    plan = dataclasses.replace(plan, vehicle=str(scenario.vehicle.path), friction=scenario.told_friction)
+    plan = dataclasses.replace(plan, vehicle=str(scenario.vehicle.path), friction=scenario.assumed_friction)
     load(plan)
     _make_output(plan)
     print(f"{scenario.name}: {scenario.about}")

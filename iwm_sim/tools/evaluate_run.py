@@ -125,15 +125,15 @@ def _with_policy(
     name: str, case: Case, options: argparse.Namespace, find: Callable[[str, float], str], policies: Policies
 ) -> Case:
     if name in VARIANTS:
-        return dataclasses.replace(case, policy=policies.of_variant(name, case.idle_drive, case.told_friction))
+        return dataclasses.replace(case, policy=policies.of_variant(name, case.idle_drive, case.law_friction))
     if name in POLICY_STRATEGIES and options.friction_source == "estimated":
         return dataclasses.replace(case, policies=options.policy, label=f"{name}, friction estimated")
     if name in POLICY_STRATEGIES:
-        return dataclasses.replace(case, policy=find(case.idle_drive, case.told_friction))
+        return dataclasses.replace(case, policy=find(case.idle_drive, case.law_friction))
     if name != "preview":
         return case
     if options.switching_cost is None:
-        case = cases.priced_as(case, find(case.idle_drive, case.told_friction))
+        case = cases.priced_as(case, find(case.idle_drive, case.law_friction))
     else:
         case = dataclasses.replace(case, switching_cost_j=options.switching_cost)
     return dataclasses.replace(case, label=f"preview, {case.price_text}")

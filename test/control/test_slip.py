@@ -14,8 +14,8 @@ from iwm_power_manager.control.slip import (
     UNLIMITED_NM,
     filtered,
     gained_radps,
+    limiter_torque_nm,
     road_torque_nm,
-    torque_room_nm,
     worse_slip,
 )
 from iwm_power_manager.control.types import initial_state
@@ -73,7 +73,7 @@ AXLE = SimpleNamespace(wheel=SimpleNamespace(radius_m=RADIUS, inertia_kgm2=INERT
     SETTINGS,
 )
 def test_the_room_is_the_road_s_torque_and_what_turns_the_wheel_to_its_target(braking, road, wheel, speed, s):
-    room = torque_room_nm(
+    room = limiter_torque_nm(
         braking, road, wheel, speed, s.slip_target, s.slip_limiter_s, s.slip_speed_floor_mps, RADIUS, INERTIA
     )
     expected = oracle.grip(braking, road, wheel, speed, s.slip_target, s, AXLE)
@@ -85,19 +85,19 @@ def test_the_room_is_the_road_s_torque_and_what_turns_the_wheel_to_its_target(br
 
 
 def test_brakes_can_always_hold_a_car_at_rest():
-    assert torque_room_nm(True, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == UNLIMITED_NM
-    assert torque_room_nm(True, 0.0, 0.0, 1.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) < UNLIMITED_NM
+    assert limiter_torque_nm(True, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == UNLIMITED_NM
+    assert limiter_torque_nm(True, 0.0, 0.0, 1.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) < UNLIMITED_NM
 
 
 def test_at_walking_pace_braking_steers_the_wheel_to_a_stop_and_never_backwards():
     # A slip speed of 0.3 m/s would be backwards at 0.1 m/s.
-    room = torque_room_nm(True, -10.0, 0.0, 0.1, 0.15, 0.03, 0.05, RADIUS, INERTIA)
+    room = limiter_torque_nm(True, -10.0, 0.0, 0.1, 0.15, 0.03, 0.05, RADIUS, INERTIA)
     assert room == pytest.approx(10.0)
 
 
 def test_a_car_at_rest_can_start():
     # 0.3 m/s of slip speed within 0.03 s.
-    assert torque_room_nm(False, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == pytest.approx(
+    assert limiter_torque_nm(False, 0.0, 0.0, 0.0, 0.15, 0.03, 1.0, RADIUS, INERTIA) == pytest.approx(
         0.3 / RADIUS * INERTIA / 0.03
     )
 

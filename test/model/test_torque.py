@@ -38,20 +38,20 @@ def test_the_critical_slip_is_a_parameter():
 
 
 @given(POWER, POWER, POWER, POWER)
-def test_what_one_axle_has_no_room_for_goes_to_the_other(front, rear, front_room, rear_room):
-    given_front, given_rear = allocate(front, rear, front_room, rear_room)
-    assert 0.0 <= given_front <= front_room
-    assert 0.0 <= given_rear <= rear_room
+def test_what_one_axle_has_no_room_for_goes_to_the_other(front, rear, front_capacity, rear_capacity):
+    given_front, given_rear = allocate(front, rear, front_capacity, rear_capacity)
+    assert 0.0 <= given_front <= front_capacity
+    assert 0.0 <= given_rear <= rear_capacity
     slack = 1e-9 * (front + rear)
-    assert given_front + given_rear == pytest.approx(min(front + rear, front_room + rear_room), abs=slack)
+    assert given_front + given_rear == pytest.approx(min(front + rear, front_capacity + rear_capacity), abs=slack)
     # Nobody gives more than asked unless the other one could not.
-    assert given_front <= front + slack or given_rear >= min(rear, rear_room) - slack
-    if front <= front_room and rear <= rear_room:
+    assert given_front <= front + slack or given_rear >= min(rear, rear_capacity) - slack
+    if front <= front_capacity and rear <= rear_capacity:
         assert (given_front, given_rear) == pytest.approx((front, rear), abs=slack)
-    if rear > rear_room:
-        assert given_rear == pytest.approx(rear_room, abs=slack)
-    if front > front_room:
-        assert given_front == pytest.approx(front_room, abs=slack)
+    if rear > rear_capacity:
+        assert given_rear == pytest.approx(rear_capacity, abs=slack)
+    if front > front_capacity:
+        assert given_front == pytest.approx(front_capacity, abs=slack)
 
 
 def test_rounding_never_gives_an_axle_less_than_nothing():
@@ -73,14 +73,18 @@ def test_motor_and_friction_brake_share_the_braking(torque, wheel, speed, heat):
 
 
 @given(POWER, st.floats(1.0, 100.0), st.floats(1.0, 100.0), st.floats(0.0, 900.0), st.floats(0.0, 900.0), st.booleans())
-def test_the_wheels_of_an_axle_share_equally_until_one_has_no_room(power, left, right, room_left, room_right, even):
+def test_the_wheels_of_an_axle_share_equally_until_one_has_no_room(
+    power, left, right, capacity_left, capacity_right, even
+):
     if even:
-        room_right = room_left
-    power = min(power, left * room_left + right * room_right)
-    torques = between_wheels(power, left, right, room_left, room_right)
+        capacity_right = capacity_left
+    power = min(power, left * capacity_left + right * capacity_right)
+    torques = between_wheels(power, left, right, capacity_left, capacity_right)
     assert torques[0] * left + torques[1] * right == pytest.approx(power, rel=1e-9, abs=1e-9)
-    for torque, room in zip(torques, (room_left, room_right), strict=True):
+    for torque, room in zip(torques, (capacity_left, capacity_right), strict=True):
         assert 0.0 <= torque <= room * (1.0 + 1e-9) + 1e-9
-    assert between_wheels(power, right, left, room_right, room_left)[::-1] == pytest.approx(torques, rel=1e-9, abs=1e-9)
+    assert between_wheels(power, right, left, capacity_right, capacity_left)[::-1] == pytest.approx(
+        torques, rel=1e-9, abs=1e-9
+    )
     if torques[0] != torques[1]:
-        assert min(torques) == min(room_left, room_right)
+        assert min(torques) == min(capacity_left, capacity_right)

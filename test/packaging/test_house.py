@@ -50,3 +50,29 @@ def test_no_test_knows_a_private_name() -> None:
         if name.startswith("_") and not name.startswith("__") and name not in PUBLIC
     ]
     assert not found
+
+
+#: Words of ours for what the field has a name for: capacity, driver, assumed (docs/glossary.md).
+OURS = {"room", "rooms", "foot", "told"}
+
+
+def public_names(tree: ast.AST) -> Iterator[str]:
+    """Names of functions and classes, their parameters and fields, without an underscore before them."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.arg):
+            yield node.arg
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            yield node.target.id
+
+
+@pytest.mark.parametrize("folder", ["iwm_power_manager", "iwm_sim"])
+def test_names_use_the_words_of_the_field(folder) -> None:
+    found = [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in sources(folder)
+        for name in public_names(ast.parse(path.read_text()))
+        if OURS & set(name.lower().split("_"))
+    ]
+    assert not found

@@ -76,10 +76,10 @@ def test_stepping_the_kernels_from_python_gives_the_bits_of_the_compiled_loop():
     settings = default_settings("instantaneous_slip")
     compiled = run(SHORT, CAR, settings, TABLE, 0.5, assumed_friction=0.4, substeps=2, noise=noise)
     trace = sample(SHORT, dt, params.driver.preview_s)
-    car, foot, state = plant.initial_plant(params, 0.8, 0.0), DriverState(0.0), initial_state()
+    car, driver, state = plant.initial_plant(params, 0.8, 0.0), DriverState(0.0), initial_state()
     for k in range(steps):
         at = [float(x[k]) for x in trace]
-        pedals, foot = drive(foot, car.speed_mps, *at, dt, params)
+        pedals, driver = drive(driver, car.speed_mps, *at, dt, params)
         measurement = closed_loop.measure(
             car,
             pedals.power_demand_w,

@@ -28,7 +28,7 @@ def stop(speed_mps, pedal, friction, broken):
         speed_mps=speed_mps,
         demand=(Demand(0.5, "brake", pedal),),
         friction=(Friction(0.0, friction, friction),),
-        told_friction=0.9,
+        assumed_friction=0.9,
         faults=broken,
         duration_s=60.0,
         to_standstill=True,

@@ -66,7 +66,7 @@ def test_each_way_of_asking_moves_the_car_its_way(demand, sign):
 
 def test_the_road_is_where_each_wheel_stands():
     split = dataclasses.replace(
-        STOP, friction=(Friction(0.0, 0.2, 0.8), Friction(5.0, 0.5, 0.5)), told_friction=0.2, duration_s=1.0
+        STOP, friction=(Friction(0.0, 0.2, 0.8), Friction(5.0, 0.5, 0.5)), assumed_friction=0.2, duration_s=1.0
     )
     first = Drive(split, dt_s=0.01)
     assert first.friction == (0.2, 0.8, 0.2, 0.8)

@@ -71,7 +71,7 @@ def test_a_full_file_becomes_what_it_says(tmp_path):
     assert (scenario.foreign_brakes, scenario.imu) == (((2.0, 4.0),), True)
     assert scenario.friction == (Friction(0.0, 0.2, 0.9), Friction(50.0, 0.4, 0.4))
     assert scenario.grade == ((0.0, 0.0), (10.0, 0.1))
-    assert scenario.told_friction == 0.2
+    assert scenario.assumed_friction == 0.2
     assert scenario.demand == (Demand(0.5, "brake", 1.0),)
     assert scenario.faults == (
         Fault("vehicle_speed", "factor", 1.2, 1.0, 2.0),
@@ -122,7 +122,7 @@ def test_a_cycle_and_a_vehicle_may_stand_beside_the_file(tmp_path):
         ({"road": {"friction": 3.0}}, "road.friction: 3.0 is out of range; allowed: 0.05 to 1.5"),
         ({"road": {"friction": [{"from_m": 0.0, "left": 0.5}]}}, r"road.friction\[0\].right: is missing"),
         ({"road": {"friction": 0.5, "grade": 2.0}}, "road.grade"),
-        ({"told_friction": 0.0}, "told_friction"),
+        ({"assumed_friction": 0.0}, "assumed_friction"),
         ({"faults": {}}, r"faults: \{\} is no list"),
         ({"faults": [{"factor": 1.0}]}, r"faults\[0\]: names nothing that fails"),
         ({"faults": [{"sensor": "gps", "factor": 1.0}]}, r"faults\[0\].sensor: 'gps' is unknown"),

@@ -23,7 +23,7 @@ def it_stays_straight(speed_mps, low, times, left_low):
     sides = (low, min(low * times, 1.0))
     left, right = sides if left_low else sides[::-1]
     scenario = dataclasses.replace(
-        BASE, speed_mps=speed_mps, friction=(Friction(-100.0, left, right),), told_friction=low, require=()
+        BASE, speed_mps=speed_mps, friction=(Friction(-100.0, left, right),), assumed_friction=low, require=()
     )
     run = driven(drive_scenario(scenario), scenario.truth)
     sideways = np.degrees(np.arctan2(np.abs(run["lateral_speed_mps"]), np.maximum(np.abs(run["speed_mps"]), 3.0)))

@@ -60,7 +60,7 @@ def braking(speed_mps: float, power_w: float, friction: float, broken: tuple[Fau
         speed_mps=speed_mps,
         demand=(Demand(1.0, "power_w", -power_w),),
         friction=(Friction(0.0, friction, friction),),
-        told_friction=0.9,
+        assumed_friction=0.9,
         faults=broken,
         duration_s=MOST_S,
     )
@@ -96,6 +96,6 @@ def test_with_true_sensors_no_wheel_skids_on_a_slippery_road(speed_mps, power_w)
     scenario = dataclasses.replace(
         braking(speed_mps, power_w, 0.2, ()),
         require=(Bound("longest_beyond_critical_s", -math.inf, 0.1, aim=False),),
-        told_friction=0.9,
+        assumed_friction=0.9,
     )
     assert check_scenario(scenario).values["longest_beyond_critical_s"] <= 0.1
