@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -131,26 +130,22 @@ def _rival(study: Study) -> str:
 
 def _nothing(study: Study) -> str:
     most = {place: saving for place, cell in by_place(study.cells).items() if (saving := most_saved(cell)) is not None}
-    little = [
-        f"{place.cycle} at friction {place.friction:g}"
-        for place, saving in most.items()
-        if place.idle_drive == "drag" and saving < LITTLE_PERCENT
-    ]
+    little: dict[str, list[str]] = {}
+    for place, saving in most.items():
+        if place.idle_drive == "drag" and saving < LITTLE_PERCENT:
+            little.setdefault(place.cycle, []).append(f"{place.friction:g}")
     none, drag = (
         [saving for place, saving in most.items() if place.idle_drive == idle_drive] for idle_drive in ("none", "drag")
     )
     where = ""
     if little:
-        where = f"With an idle axle that drags, no strategy saves {LITTLE_PERCENT} % on {_listed(little)}. "
+        places = " and ".join(f"{cycle} at friction {', '.join(frictions)}" for cycle, frictions in little.items())
+        where = f"With an idle axle that drags, no strategy saves {LITTLE_PERCENT} % on {places}. "
     return (
         f"{where}The best of all strategies, those that know the whole cycle and change the split at will included, "
         f"saves {min(drag):.2f} to {max(drag):.2f} % with idle drive drag, {min(none):.2f} to {max(none):.2f} % with "
         "none: what an idle axle costs decides more than the strategy does."
     )
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
 
 
 #: Words of the study's tables.

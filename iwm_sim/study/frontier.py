@@ -53,18 +53,18 @@ _DT_S = 0.01
 def _setting(point: Point) -> str:
     if point.strategy == "instantaneous":
         return ""
-    return f"{point.setting:g} {'W' if point.strategy == RIVAL else 'changes/min'}"
+    return f"{point.setting:g} {'W' if point.strategy == RIVAL else 'a minute'}"
 
 
 #: Columns of a table of points.
 POINT_COLUMNS: tuple[Column[Point], ...] = (
     Column("strategy", lambda point: point.strategy),
-    Column("threshold or budget", _setting),
-    Column("changes/min > 0.25", lambda point: point.changes_per_min, decimals=1),
-    Column("> 0.05", lambda point: point.fine_changes_per_min, decimals=1),
-    Column("moves/min", lambda point: point.travel_per_min, decimals=1),
-    Column("busiest minute", lambda point: point.busiest_minute, decimals=0),
-    Column("saving %", lambda point: point.saving_percent, decimals=3),
+    Column("threshold", _setting, "or budget"),
+    Column("> 0.25", lambda point: point.changes_per_min, "1/min", 1, group="changes"),
+    Column("> 0.05", lambda point: point.fine_changes_per_min, "1/min", 1, group="changes"),
+    Column("moves", lambda point: point.travel_per_min, "1/min", 1),
+    Column("minute", lambda point: point.busiest_minute, decimals=0, group="busiest"),
+    Column("saving", lambda point: point.saving_percent, "%", 3),
     Column("trace", lambda point: "held" if point.held else "lost"),
     Column("policy", lambda point: point.policy),
 )

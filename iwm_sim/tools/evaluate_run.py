@@ -335,7 +335,7 @@ def _frontier(options: argparse.Namespace) -> None:
 
 def _show_frontier(made: frontier.Frontier, picture: Path) -> None:
     print(f"{made.label}, {made.made_with}\n{plain_table(made.points, frontier.POINT_COLUMNS, screen())}")
-    print("moves/min: sum of all moves, 1 being all the power; preview: the bound, the whole drive known in advance")
+    print("moves: sum of all moves, 1 being all the power; preview: the bound, the whole drive known in advance")
     print(f"picture: {picture}\n")
 
 
