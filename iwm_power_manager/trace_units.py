@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,17 @@ _TOO_LIVELY, _LIVELIEST = 1.7, 1.2
 #: What driving looks like, m/s2: the harder of acceleration and braking is more than this, and neither beyond its own.
 _USUAL_LOW, _USUAL_RISE, _USUAL_FALL = 0.3, 5.0, 9.0
 _MAX_SPEED_MPS = 70.0
+#: Speed and wheels that are further apart are not in the units they were read in.
+_APART = 1.25
+#: How many times too fast the speed seems, by what was read in a wrong unit, and how near to that counts.
+_LIKELY = {
+    3.6: "speed in km/h",
+    2.237: "speed in mph",
+    1.0 / 3.6: "speed in m/s, read as km/h",
+    math.pi / 30.0: "wheel_speed in rpm",
+    math.pi / 180.0: "wheel_speed in deg/s",
+}
+_NEAR = 0.05
 
 
 class Steepest(NamedTuple):
@@ -131,6 +143,17 @@ def implausible(time_s: FloatArray, speed_mps: FloatArray) -> tuple[int, str] | 
     if not problem:
         return None
     return at, problem
+
+
+def apart(shown: float, rolled: float, radius_m: float) -> str:
+    """A line, if a speed and that of the wheels' rims cannot both be in the unit they were read in; "" else."""
+    ratio = shown / rolled if rolled else math.inf
+    if 1.0 / _APART < ratio < _APART:
+        return ""
+    likely = {**_LIKELY, 1.0 / radius_m: "wheel_speed in m/s"}
+    meant = [text for factor, text in likely.items() if math.isclose(ratio, factor, rel_tol=_NEAR)]
+    words = " or ".join(meant) or "another unit, or another wheel radius"
+    return f"speed is {ratio:.3g} times what wheel_speed and a radius of {radius_m:g} m give: {words}?"
 
 
 def hint(time_s: FloatArray, speed_mps: FloatArray) -> str:

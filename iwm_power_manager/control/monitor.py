@@ -28,6 +28,7 @@ from iwm_power_manager.control.inputs import (
     judge_wheels,
 )
 from iwm_power_manager.control.types import Wheels
+from iwm_power_manager.trace_units import apart
 
 SPEED = "vehicle_speed"
 WHEELS = "wheel_states"
@@ -47,6 +48,8 @@ _OF_VALUES = (Violation.OUT_OF_RANGE, Violation.NOT_FINITE, Violation.AXLE_LOST,
 _OTHER_CLOCK_S, _UNSTAMPED_S = 1.0, 1e9
 #: Speeds that agree differ by no more than this, and this part of the largest.
 _SAME_MPS, _SAME = 0.5, 0.1
+#: At less, the ratio of two speeds says nothing.
+_MOVING_MPS = 2.0
 #: The battery comes a tenth as often as the other inputs.
 _SLOW = 10.0
 
@@ -128,6 +131,7 @@ class Tally:
     ----------
     received : all messages
     dropped : by reason
+    in_a_row : of these, those since the last accepted one
     accepted_ns : time of the last accepted one: its stamp, or when it was received if it has none (None: none yet)
     violation : why the last message was dropped, or was accepted with a reservation
     describe : says more of a message whose values were refused; None: the value, and what is allowed
@@ -137,6 +141,7 @@ class Tally:
 
     received: int = 0
     dropped: Counter[Violation] = field(default_factory=Counter)
+    in_a_row: Counter[Violation] = field(default_factory=Counter)
     accepted_ns: int | None = None
     violation: Violation = Violation.NONE
     describe: Callable[[], str] | None = None
@@ -182,8 +187,10 @@ class Tally:
         self.violation = violation
         if violation is Violation.NONE:
             self.accepted_ns = time_ns
+            self.in_a_row.clear()
             return True
         self.dropped[violation] += 1
+        self.in_a_row[violation] += 1
         return False
 
 
@@ -258,6 +265,12 @@ class InputMonitor:
         """`vehicle_speed` and all wheels show the same motion."""
         shown = self.shown_mps
         return max(shown) - min(shown) <= _SAME_MPS + _SAME * max(map(abs, shown))
+
+    @property
+    def apart(self) -> str:
+        """By what factor `vehicle_speed` and the wheels contradict each other, and the unit probably meant; or ""."""
+        speed, *rims = map(abs, self.shown_mps)
+        return apart(speed, sum(rims) / len(rims), self._limits.radius_m) if max(speed, *rims) > _MOVING_MPS else ""
 
     def take_speed(self, reading: SpeedReading, now_ns: int) -> bool:
         """Judge `vehicle_speed`; True if it was accepted."""
@@ -344,6 +357,7 @@ class InputMonitor:
         if violation is Violation.NONE:
             last = math.nan if tally.accepted_ns is None else self.demand_w
             violation = check_value(demand_w, last, tally.age_s(now_ns), self._limits.demand)
+            violation = Violation.OUT_OF_RANGE if math.isinf(demand_w) else violation  # of a pedal beyond its way
         if tally.note(violation, now_ns - int(lag_s * _NS_PER_S)):
             self.demand_w = demand_w
             self.demand_speed_mps = self.speed_mps

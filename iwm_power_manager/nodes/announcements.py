@@ -202,7 +202,7 @@ class Announcements:
             silent = tuple(topic for topic in found if topic in trouble) or self._silent(found, now_ns)
             reason = "; ".join(dict.fromkeys(trouble[topic] for topic in silent if topic in trouble))
             if not reason and tally.why():
-                reason = f"{tally.dropped[tally.violation]} messages refused, {tally.why()}"
+                reason = f"{tally.in_a_row[tally.violation]} messages refused, {tally.why()}"
                 found = () if name == DEMAND and tally.described() else found  # which says on what topic
             elif not reason and tally.received:
                 age_s = tally.age_s(now_ns)

@@ -70,7 +70,7 @@ class PowerManagerReport:
         self._steps = 0
         self._doubted: Counter[int] = Counter()
         self._cut_steps = 0
-        self._cut = ""
+        self._cut = self._apart = ""
         self.doubts: list[str] = []
 
     def note_step(
@@ -133,8 +133,11 @@ class PowerManagerReport:
                     self._wheel_names,
                 )
             )
+            self._apart = (self._apart or controller.monitor.apart) if self._doubted else ""  # the same words, as above
             agree = controller.monitor.agree
-            sensors = diagnostics.sensors_status(self._doubted, self._steps, self._wheel_names, agree=agree)
+            sensors = diagnostics.sensors_status(
+                self._doubted, self._steps, self._wheel_names, agree=agree, apart=self._apart
+            )
             if self._steps >= _FEW_STEPS:
                 self.doubts = [sensors.message] if sensors.level != diagnostics.OK else []
                 self.doubts += [self._cut] if self._cut else []

@@ -122,7 +122,8 @@ class TopicComparer:
         self._found = TopicComparison(topic)
         self._younger = younger
         self._tolerance = tolerance
-        self._waiting: tuple[OrderedDict[int, _Side], OrderedDict[int, _Side]] = (OrderedDict(), OrderedDict())
+        # By stamp; an answer that was sent again has the stamp of the first.
+        self._waiting: tuple[OrderedDict[int, list[_Side]], ...] = (OrderedDict(), OrderedDict())
         self._unpaired = [0, 0]
         self._count = 0
         self._squares = 0.0
@@ -138,21 +139,22 @@ class TopicComparer:
     def result(self) -> TopicComparison:
         """What has been found so far."""
         recorded, recomputed = (
-            count + len(waiting) for count, waiting in zip(self._unpaired, self._waiting, strict=True)
+            count + sum(map(len, held.values())) for count, held in zip(self._unpaired, self._waiting, strict=True)
         )
         rms = math.sqrt(self._squares / self._count) if self._count else 0.0
         return replace(self._found, rms=rms, only_recorded=recorded, only_recomputed=recomputed)
 
     def _add(self, side: int, stamp_ns: int, new: _Side) -> None:
-        other = self._waiting[1 - side].pop(stamp_ns, None)
-        if other is not None:
+        waiting, others = self._waiting[side], self._waiting[1 - side]
+        if stamp_ns in others:
+            other = others[stamp_ns].pop(0)
+            if not others[stamp_ns]:
+                del others[stamp_ns]
             self._compare(stamp_ns, *((new, other) if side == 0 else (other, new)))
             return
-        waiting = self._waiting[side]
-        waiting[stamp_ns] = new
+        waiting.setdefault(stamp_ns, []).append(new)
         if len(waiting) > _WINDOW:
-            waiting.popitem(last=False)
-            self._unpaired[side] += 1
+            self._unpaired[side] += len(waiting.popitem(last=False)[1])
 
     def _compare(self, stamp_ns: int, recorded: _Side, recomputed: _Side) -> None:
         result = self._found

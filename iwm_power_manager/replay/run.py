@@ -8,7 +8,6 @@ steps are made from the mapped input signals.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
@@ -29,24 +28,14 @@ from iwm_power_manager.signals.contract import POWER_MANAGER_STATE as STATE
 from iwm_power_manager.signals.mapping import SignalMapping, topic_named
 from iwm_power_manager.signals.readings import joint_state_writer
 from iwm_power_manager.signals.types import definition_of
+from iwm_power_manager.trace_units import apart
 
 #: How the state's topic ends, whatever its node is called.
 _STATE_OF_ANY = "/state"
 #: Messages between two calls of `progress`.
 PROGRESS_EVERY = 2000
-#: Speed and wheels of a drive that are further apart on average are not in the units they were read in; below this sum
-#: of speeds, m/s, there is no drive.
-_APART = 1.25
+#: Below this sum of speeds, m/s, there is no drive.
 _MOVING_MPS = 10.0
-#: How many times too fast the speed seems, by what was read in a wrong unit, and how near to that counts.
-_LIKELY = {
-    3.6: "speed in km/h",
-    2.237: "speed in mph",
-    1.0 / 3.6: "speed in m/s, read as km/h",
-    math.pi / 30.0: "wheel_speed in rpm",
-    math.pi / 180.0: "wheel_speed in deg/s",
-}
-_NEAR = 0.05
 #: How many topics are named that may be a command under another name, and what to do with one.
 _CANDIDATES = 5
 _RENAME = "if it is one of them: --mapping with a copy of that file that has the recorded name"
@@ -135,13 +124,7 @@ class Replay:
         """A line, if speed and wheel speeds cannot both be in the unit they were read in."""
         if max(self._shown_mps, self._rolled_mps) < _MOVING_MPS:
             return []
-        ratio = self._shown_mps / self._rolled_mps if self._rolled_mps else math.inf
-        if 1.0 / _APART < ratio < _APART:
-            return []
-        likely = {**_LIKELY, 1.0 / self._radius_m: "wheel_speed in m/s"}
-        meant = [text for factor, text in likely.items() if math.isclose(ratio, factor, rel_tol=_NEAR)]
-        hint = " or ".join(meant) or "another unit, or another wheel radius"
-        return [f"speed is {ratio:.3g} times what wheel_speed and a radius of {self._radius_m:g} m give: {hint}?"]
+        return list(filter(None, [apart(self._shown_mps, self._rolled_mps, self._radius_m)]))
 
     def _find_commands(self, mapping: SignalMapping, tolerance: float) -> None:
         for name, (kind, sink) in command_topics(self._bag, mapping).items():

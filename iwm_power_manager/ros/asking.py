@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Call a service again whose answer stays away: one is lost where its sender has not found yet who asked."""
+"""Ask other nodes: who is there, and again what has not been answered, for an answer may be lost."""
 
 from __future__ import annotations
 
@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rclpy.client import Client
+    from rclpy.node import Node
     from rclpy.task import Future
 
 AGAIN_S = 5.0
+
+
+def others_there(node: Node, name: str) -> str:
+    """The end of a message that there is no power manager `name`: those that `node` has found under other names."""
+    found = (f"{space.rstrip('/')}/{own}" for own, space in node.get_node_names_and_namespaces())
+    others = ", ".join(sorted({full for full in found if full.endswith("/power_manager")} - {name}))
+    return f"; there is {others}: name it with --node" if others else ""
 
 
 class Question:

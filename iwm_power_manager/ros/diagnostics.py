@@ -94,7 +94,7 @@ class LoopStatistics:
             values["period, max (ms)"] = f"{max(periods_s) * 1e3:.3f}"
             if rate_hz is not None:
                 problems += _beyond(
-                    abs(mean_hz - rate_hz), limits, "periodicity", "hz", f"deviation from {rate_hz:g} Hz"
+                    abs(mean_hz - rate_hz), limits, "periodicity", "hz", f"{mean_hz:.1f} instead of {rate_hz:g} Hz:"
                 )
         elif rate_hz is not None:
             problems.append((ERROR, "no step since the last report"))
@@ -222,7 +222,9 @@ def brakes_status(gain: Wheels, wheel_names: Sequence[str]) -> Status:
     return Status("brakes", *_worst(problems), values)
 
 
-def sensors_status(doubted_steps: Mapping[int, int], steps: int, wheel_names: Sequence[str], *, agree: bool) -> Status:
+def sensors_status(
+    doubted_steps: Mapping[int, int], steps: int, wheel_names: Sequence[str], *, agree: bool, apart: str = ""
+) -> Status:
     """Which speed sensors the law did not believe in most of its steps, because they contradict the others.
 
     Parameters
@@ -231,6 +233,7 @@ def sensors_status(doubted_steps: Mapping[int, int], steps: int, wheel_names: Se
     steps : steps since the last report
     wheel_names : the wheels in their order
     agree : all of them show the same motion
+    apart : by what factor `vehicle_speed` and the wheels do not
     """
     names = [*(f"wheel {name}" for name in wheel_names), "vehicle_speed"]
     values = {
@@ -238,7 +241,8 @@ def sensors_status(doubted_steps: Mapping[int, int], steps: int, wheel_names: Se
         for number, name in enumerate(names)
     }
     contradicted = [name for number, name in enumerate(names) if 2 * doubted_steps.get(number, 0) > steps]
-    problem = f"{', '.join(contradicted)} not believed: contradicts the others; right unit and scale?"
+    why = apart if names[-1] in contradicted or len(contradicted) == len(wheel_names) else ""
+    problem = f"{', '.join(contradicted)} not believed: {why or 'contradicts the others; right unit and scale?'}"
     if agree and contradicted == names:
         problem = "vehicle_speed and wheels agree, but not with the motion before: car, bench or bag started over? "
         problem += "then deactivate and activate this node as well"

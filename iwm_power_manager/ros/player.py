@@ -152,7 +152,10 @@ class _Player:
                 publisher.publish(message.data)
                 self._sent += 1
         if self._sent == before:
-            raise BagError(f"{self._bag.path}: holds no message to play between --start and --end")
+            playable = [offset for offset, _, message in paced(self._bag, []) if message.topic in self._publishers]
+            span = [f"{offset / _NS_PER_S:.3f}" for offset in playable[:1] + playable[-1:]]
+            there = f"; it holds some from {' to '.join(span)} s" if span else ""
+            raise BagError(f"{self._bag.path}: holds no message to play between --start and --end{there}")
         return True
 
     def finish(self) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import FailedError, IwmError, did_you_mean, spelled_like
 from iwm_power_manager.exit_codes import DONE, FAILED
-from iwm_power_manager.ros.asking import AGAIN_S, Question
+from iwm_power_manager.ros.asking import AGAIN_S, Question, others_there
 from iwm_power_manager.ros.specs import ParameterError
 from iwm_power_manager.tools.options import number
 
@@ -44,9 +44,7 @@ class _Remote:
             self._clients[service] = self._node.create_client(kind, f"{self._name}/{service}")
         if not self._clients[service].wait_for_service(self._patience_s):
             what = "no such node" if "parameters" in service else "no such node with a lifecycle"
-            found = (f"{space.rstrip('/')}/{name}" for name, space in self._node.get_node_names_and_namespaces())
-            others = ", ".join(sorted({name for name in found if name.endswith("/power_manager")} - {self._name}))
-            there = f"; there is {others}: name it with --node" if others else ""
+            there = others_there(self._node, self._name)
             raise FailedError(f"{self._name}: {what} on this domain within {self._patience_s:g} s{there}")
         return self._clients[service]
 

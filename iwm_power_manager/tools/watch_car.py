@@ -119,6 +119,7 @@ class Feed:
     topic : full name of the state's topic
     car : the vehicle's name; "" as long as the node has not said it
     foreign_brakes : the node says that another system has the friction brakes
+    others : what there is to say of nodes with other names
     """
 
     def __init__(self) -> None:
@@ -127,6 +128,7 @@ class Feed:
         self.topic = f"/{POWER_MANAGER_STATE}"
         self.car = ""
         self.foreign_brakes = False
+        self.others = ""
         self._heard = 0
         self._heard_s = time.monotonic()
         self._first_s: float | None = None
@@ -158,7 +160,7 @@ class Feed:
         """What is waited for; "" while steps come."""
         silent_s = time.monotonic() - self._heard_s
         if not self.rows:
-            return f"waiting for {self.topic} ({silent_s:.0f} s)"
+            return f"waiting for {self.topic} ({silent_s:.0f} s){self.others}"
         return f"nothing new on {self.topic} for {silent_s:.0f} s" if silent_s > QUIET_S else ""
 
     def since(self, number: int) -> list[Row]:
@@ -292,6 +294,7 @@ def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread,
     from sensor_msgs.msg import JointState
 
     from iwm_power_manager.ros import messages, qos
+    from iwm_power_manager.ros.asking import others_there
 
     rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     node = Node("watch_car", enable_rosout=False, start_parameter_services=False)
@@ -311,7 +314,12 @@ def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread,
             values = {entry.key: entry.value for entry in status.values}
             feed.status(status.name, status.level[0], status.message, values)
 
+    def looked() -> None:
+        if not feed.rows:
+            feed.others = others_there(node, feed.node)
+
     node.create_subscription(DiagnosticArray, DIAGNOSTICS, diagnosed, asked)
+    node.create_timer(QUIET_S, looked)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
 

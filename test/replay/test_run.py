@@ -681,6 +681,11 @@ def test_a_comparison_tells_largest_rms_first_and_what_has_no_counterpart() -> N
     assert dataclasses.asdict(found.first) == {
         "message": 1, "stamp_ns": 2, "log_time_ns": 102, "name": "a", "recorded": 1.0, "recomputed": 4.0,
     }  # fmt: skip
+    for side in (comparer.recorded, comparer.recomputed):  # an answer that was sent again
+        side(7, 107, ("a", "b"), (1.0, 1.0))
+        side(7, 108, ("a", "b"), (1.0, 1.0))
+    assert dataclasses.replace(comparer.result(), compared=3, rms=found.rms) == found
+    assert comparer.result().compared == 5
     comparer.recorded(6, 106, ("a",), (0.0,))
     comparer.recomputed(6, 0, ("a", "b"), (0.0, 1.0))  # a value the record lacks
     assert comparer.result().largest == np.inf

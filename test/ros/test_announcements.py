@@ -122,7 +122,8 @@ def test_refused_messages_are_counted_by_their_reason_and_a_described_one_names_
     says.prepared(prepared(1.0, 0))
     tallies = {name: Tally() for name in STALE_NAMES.values()}
     tallies[DEMAND].describe = lambda: "accelerator_pedal 300 % on accelerator; allowed: 0 to 100"
-    for violation in (Violation.LATE, Violation.LATE, Violation.NOT_FINITE, Violation.OUT_OF_RANGE):
+    before = (Violation.OUT_OF_RANGE, Violation.NONE)  # which is over
+    for violation in (*before, Violation.LATE, Violation.LATE, Violation.NOT_FINITE, Violation.OUT_OF_RANGE):
         tallies[DEMAND].note(violation, 0)
     controller: Any = SimpleNamespace(
         supervision=Supervision(mode=MODE_DEGRADED, stale=STALE_DEMAND),

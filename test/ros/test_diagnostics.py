@@ -243,7 +243,7 @@ def test_an_input_that_does_not_come_is_missing_and_not_doubted(stale, named):
     controller = SimpleNamespace(
         supervision=Supervision(stale=stale),
         command=command,
-        monitor=SimpleNamespace(tallies={}, verdicts=(WheelVerdict.GOOD,) * 4, agree=False),
+        monitor=SimpleNamespace(tallies={}, verdicts=(WheelVerdict.GOOD,) * 4, agree=False, apart=""),
         actuators=ActuatorState(),
         brake_gain=(1.0,) * 4,
     )

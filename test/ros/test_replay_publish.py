@@ -187,6 +187,16 @@ def test_ctrl_c_ends_an_endless_loop_cleanly(tmp_path: Path, start: Callable[...
     assert "published" in out
 
 
+def test_a_part_without_messages_is_refused_with_the_part_that_has_some(
+    tmp_path: Path, start: Callable[..., subprocess.Popen[str]]
+) -> None:
+    inputs = ScriptedDrive("equal").write(tmp_path / "inputs", 50, state=False, commands=False)
+    player = start("tools.replay", str(inputs), "--publish", "--start", "100")
+    _, error = player.communicate(timeout=PATIENCE_S)
+    assert player.returncode == 2
+    assert "holds no message to play between --start and --end; it holds some from 0.000 to 0." in error
+
+
 def test_an_unknown_topic_is_named(tmp_path: Path, start: Callable[..., subprocess.Popen[str]]) -> None:
     inputs = ScriptedDrive("equal").write(tmp_path / "inputs", 5, state=False, commands=False)
     player = start("tools.replay", str(inputs), "--publish", "--topics", "/nope")
