@@ -77,6 +77,11 @@ class Log:
         at = self.gaps_after(longer_s)
         return [(float(self.time_s[i]), float(self.time_s[i + 1] - self.time_s[i])) for i in at]
 
+    def across_gaps_m(self, longer_s: float) -> float:
+        """Length of straight lines over the gaps."""
+        at = np.array(self.gaps_after(longer_s), dtype=int)
+        return float(np.sum(0.5 * (self.speed_mps[at] + self.speed_mps[at + 1]) * np.diff(self.time_s)[at]))
+
     def noise_mps(self) -> float:
         """Scatter of the speed about its own trend, rms, from third differences; only where the car moves."""
         third = np.diff(self.speed_mps, 3)

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.errors import ConfigError, one_line
 from iwm_power_manager.motor_map import COLUMNS, RANGES
 from iwm_power_manager.tables import Table, read_table
 
@@ -22,7 +22,7 @@ _OTHER_UNITS = {
     "losses": (r"\b[km]w\b", "W"),
 }
 #: What the head of a column says of it.
-_TORQUE, _SPEED = re.compile("torque|moment|n ?m", re.I), re.compile("speed|drehzahl|rpm|min|rad|omega", re.I)
+_TORQUE, _SPEED = re.compile("torque|moment|n ?m(?![a-z])", re.I), re.compile("speed|drehzahl|rpm|min|rad|omega", re.I)
 #: A map with so few of its grid's points is on no grid.
 _SPARSE = 0.25
 #: No car's motor has more, N m: those are speeds, or N mm.
@@ -41,7 +41,7 @@ def read_points(
     path: Path | str,
     *,
     layout: str = "auto",
-    down: str = "speed",
+    down: str = "auto",
     separator: str = "auto",
     decimal: str = "auto",
     speed_unit: str = "auto",
@@ -53,8 +53,9 @@ def read_points(
 
     Parameters
     ----------
-    layout : list (speed, torque, value in each row; torque first if the header says so), matrix (speeds down, torques
-        across, or `down` = "torque" the other way round), or auto: three columns are a list
+    layout : list (speed, torque, value in each row; torque first if the header says so), matrix, or auto: three columns
+        are a list
+    down : speed or torque goes down in a matrix, the other across; auto: as its corner says, else speed
     speed_unit : rad/s, rpm, or auto: as the header says, else rad/s
     percent : whether efficiencies are in percent; None: if most are above 1.5
     quantity : efficiency, or loss in W
@@ -69,15 +70,20 @@ def read_points(
     said = ["decimal commas"] if table.decimal == "," else []
     guessed = layout == "auto"
     columns = len(table.rows[-1][1])
+    header = [cell for _, cells in _header(table) for cell in cells if not _is_number(table, cell)]
     if guessed:
         layout = "list" if columns == 3 else "matrix"
-        said.append(f"layout {layout}: it has {columns} columns" + (f"; {down}s down" if layout == "matrix" else ""))
-    if layout == "list" and down != "speed":
+        said.append(f"layout {layout}: it has {columns} columns")
+    if layout == "list" and down != "auto":
         raise ConfigError("arguments", "--down", f"has no effect: {path} is read as a list", "--layout matrix with it")
-    header = [cell for _, cells in _header(table) for cell in cells if not _is_number(table, cell)]
     speed_unit, doubts = _speed_unit(path, header, speed_unit, said)
-    if layout == "matrix" and down == "speed" and header and _torque_first(header[-1]):
-        doubts.append(f"speeds down, torques across, although the corner says {header[-1]!r}: --down torque?")
+    if layout == "matrix":
+        corner = _header(table)[-1][1][0]
+        if down == "auto":
+            down = "torque" if _torque_first(corner) else "speed"
+            said.append(one_line(f"{down}s down: the corner says '{corner}'" if corner else "speeds down: guessed"))
+        elif down == "speed" and _torque_first(corner):
+            doubts.append(one_line(f"speeds down, torques across, although the corner says '{corner}'"))
     _check_quantity(path, header, quantity)
     try:
         cells = _list(table, said) if layout == "list" else _matrix(table, down)
@@ -103,9 +109,7 @@ def read_points(
         points[key] = _efficiency(path, line, key, value / 100.0 if percent else value, quantity)
     most_nm = max((abs(torque) for _, torque in points), default=0.0) / gear
     if most_nm > _MOST_NM:
-        doubts.append(
-            f"torques up to {most_nm:g} N m at the motor: {'--down torque' if layout == 'matrix' else 'unit'}?"
-        )
+        doubts.append(f"torques up to {most_nm:g} N m at the motor: {'--down' if layout == 'matrix' else 'unit'}?")
     grid = len({speed for speed, _ in points}) * len({torque for _, torque in points})
     if len(points) < _SPARSE * grid:
         doubts.append(f"its points hardly lie on a grid: {len(points)} of {grid}")
@@ -150,9 +154,9 @@ def _speed_unit(path: Path | str, header: list[str], chosen: str, said: list[str
 
 
 def _torque_first(head: str) -> bool:
-    """Whether the corner of a matrix names torques before speeds, as "torque, speed": what goes down, what across."""
+    """Whether the corner of a matrix names torques, or torques before speeds: what goes down, what across."""
     torque, speed = _TORQUE.search(head), _SPEED.search(head)
-    return torque is not None and speed is not None and torque.start() < speed.start()
+    return torque is not None and (speed is None or torque.start() < speed.start())
 
 
 def _check_quantity(path: Path | str, header: list[str], quantity: str) -> None:

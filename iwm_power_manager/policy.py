@@ -131,9 +131,8 @@ class Policy:
         """Raise `PolicyError` unless this policy was solved for this car: for every number the decision model reads."""
         if self.vehicle_hash != vehicle.hash:
             raise PolicyError(
-                f"{name}: was solved for '{self.vehicle_name}' ({self.vehicle_hash}, idle_drive {self.idle_drive}), "
-                f"not for '{vehicle.name}' ({vehicle.hash}, idle_drive {vehicle.idle_drive}); "
-                "solve one for this car with solve_policy"
+                f"{name}: was solved for {_car(self.vehicle_name, self.vehicle_hash, self.idle_drive)}, not for "
+                f"{_car(vehicle.name, vehicle.hash, vehicle.idle_drive)}; solve one for this car with solve_policy"
             )
 
     def table(self, rule: Sequence[float] = (), schedule: Sequence[float] = ()) -> PolicyTable:
@@ -446,11 +445,12 @@ def load_policy_bank(path: Path | str, vehicle: Vehicle | None = None) -> list[P
     if vehicle is not None:
         if not os.path.isdir(path):
             loaded[0][1].check_vehicle(vehicle, str(path))
+        cars = {_car(policy.vehicle_name, policy.vehicle_hash, policy.idle_drive) for _, policy in loaded}
         loaded = [(file, policy) for file, policy in loaded if policy.vehicle_hash == vehicle.hash]
         if not loaded:
             raise PolicyError(
-                f"{path}: holds no policy for '{vehicle.name}' ({vehicle.hash}, idle_drive {vehicle.idle_drive}); "
-                "solve one for this car with solve_policy"
+                f"{path}: holds no policy for {_car(vehicle.name, vehicle.hash, vehicle.idle_drive)}, only for "
+                f"{', '.join(sorted(cars)[:3])}; solve one for this car with solve_policy"
             )
     first_file, first = loaded[0]
     by_friction: dict[float, Path] = {}
@@ -464,6 +464,11 @@ def load_policy_bank(path: Path | str, vehicle: Vehicle | None = None) -> list[P
                 f"'{first.vehicle_name}' ({first.vehicle_hash}): a bank holds one car's policies"
             )
     return sorted((policy for _, policy in loaded), key=lambda policy: policy.friction)
+
+
+def _car(name: str, vehicle_hash: str, idle_drive: str) -> str:
+    """A car as messages name it: two of one name that differ in a number differ in the hash."""
+    return f"'{name}' ({vehicle_hash}, idle_drive {idle_drive})"
 
 
 def choose(bank: Sequence[Policy], friction: float) -> Policy:

@@ -69,7 +69,7 @@ class Drive:
     Attributes
     ----------
     strategy : its name
-    cycle, car : what was driven
+    cycle, car, friction : what was driven
     run : series of every signal, `run["speed_mps"]`; its names with their units are `iwm_sim.closed_loop.Row`
     metrics : energy, trace, slip, changes of the split
     """
@@ -77,12 +77,23 @@ class Drive:
     strategy: str
     cycle: Cycle
     car: Vehicle
+    friction: float
     run: closed_loop.Run = field(repr=False)
     metrics: Metrics
 
-    def saving_percent(self, reference: Drive) -> float | None:
-        """Energy saved against another drive, %; None if their distances differ by 0.1 %, or one lost the trace."""
-        return rows.saving_percent(self.metrics, reference.metrics)
+    def saving_percent(self, reference: Drive) -> float:
+        """Energy saved against another drive, %; NaN if their distances differ by 0.1 %, or one lost the trace.
+
+        `IwmError` if the other is of another cycle or road: that is no saving.
+        """
+        for what, one, other in (
+            ("cycle", self.cycle.name, reference.cycle.name),
+            ("friction", self.friction, reference.friction),
+        ):
+            if one != other:
+                raise IwmError(f"no saving: one drive has {what} {one}, the other {other}")
+        saved = rows.saving_percent(self.metrics, reference.metrics)
+        return np.nan if saved is None else saved
 
     def columns(self) -> Mapping[str, NDArray[np.float64]]:
         """Every signal by name, (N,) each; units are in the names."""
@@ -161,7 +172,7 @@ def drive(
     law = (settings or default_settings())._replace(strategy=STRATEGIES[name].code)
     table = policy.table() if policy is not None and STRATEGIES[name].needs_policy else empty_table(rule=rule)
     run = closed_loop.run(loaded, car, law, table, friction, **options)
-    return Drive(name, loaded, car, run, measure(run, car.params))
+    return Drive(name, loaded, car, friction, run, measure(run, car.params))
 
 
 def _check(
@@ -199,6 +210,8 @@ def share_map(
     -------
     demand, W, (P,); speed, m/s, (V,); front share (P, V)
     """
+    check_number("arguments", "previous_share", previous_share, 0.0, 1.0)
+    check_number("arguments", "slip", slip, -1.0, 1.0)
     problem = policy.problem
     at = [
         int(np.argmin(np.abs(np.asarray(axis) - value)))

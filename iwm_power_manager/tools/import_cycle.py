@@ -48,6 +48,8 @@ exit codes: 0 written, 2 bad arguments or files, 130 interrupted
 
 #: A distance of two samples beyond so many times the usual one is a gap.
 _MISSED = 1.5
+#: A cycle of which more than this part was bridged is warned of.
+_INVENTED = 0.1
 
 
 def parser() -> argparse.ArgumentParser:
@@ -134,8 +136,13 @@ def _import(options: argparse.Namespace) -> None:
     numbers = _numbers(options, log, cycle, raw, vehicle)
     if not options.quiet:
         print(_text(options, log, numbers))
-    for warning in trace_warnings(cycle, vehicle.params, options.friction):
-        print(f"import_cycle: warning: {vehicle.name}: {warning}", file=sys.stderr)
+    invented_m = log.across_gaps_m(options.max_gap) if options.gaps == "bridge" else 0.0
+    warnings = [f"{vehicle.name}: {warning}" for warning in trace_warnings(cycle, vehicle.params, options.friction)]
+    if invented_m > _INVENTED * cycle.distance_m:
+        share = f"{invented_m / 1000.0:.2f} of {cycle.distance_m / 1000.0:.2f} km"
+        warnings.append(f"{share} are straight lines over gaps that nobody drove: --gaps cut leaves them out")
+    for warning in warnings:
+        print(f"import_cycle: warning: {warning}", file=sys.stderr)
     atomic_write(options.output, cycle_text(cycle, bool(options.grade)).encode())
     if options.plot:
         _draw(options, log, raw, cycle)

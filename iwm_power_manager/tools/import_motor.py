@@ -57,7 +57,10 @@ def parser() -> argparse.ArgumentParser:
         help="list: speed, torque, value in each row, below a header (default: %(default)s)",
     )
     table.add_argument(
-        "--down", choices=("speed", "torque"), default="speed", help="what goes down in a matrix (default: %(default)s)"
+        "--down",
+        choices=("auto", "speed", "torque"),
+        default="auto",
+        help="what goes down in a matrix (default: what its corner names first, else speed)",
     )
     table.add_argument("--speed-unit", choices=("auto", "rad/s", "rpm"), default="auto", help="default: %(default)s")
     table.add_argument(

@@ -170,7 +170,9 @@ def _solve_into(options: argparse.Namespace) -> int:
     say = _silent if options.quiet else print
 
     cycles = [load_cycle(resolve(path)) for path in options.cycle]
-    for line in (*(f"note: {note}" for note in vehicle.notes), *_doubts(cycles, vehicle, frictions)):
+    there = [str(path) for path in paths if os.path.exists(path)]
+    notes = [*vehicle.notes, *([f"replaces {', '.join(there)}"] if there else [])]
+    for line in (*(f"note: {note}" for note in notes), *_doubts(cycles, vehicle, frictions)):
         print(f"solve_policy: {line}", file=sys.stderr)
     sources = _sources(options, cycles, problem, vehicle)
     chain = chain_of(problem, sources)
@@ -295,16 +297,19 @@ def demand_warnings(chain: DemandChain, dt_s: float) -> list[str]:
     """What is thin about the demand's data, one line each."""
     lines = []
     if chain.unvisited_w.size:
-        lines.append(f"no data at {_kilowatts(chain.unvisited_w)} kW: taken to return to the nearest demand with data")
+        where = _kilowatts(chain.unvisited_w, chain.power_w)
+        lines.append(f"no data at {where} kW: taken to return to the nearest demand with data")
     if chain.thin_w.size:
-        lines.append(f"less than {THIN_ROW_STEPS * dt_s:g} s of data at {_kilowatts(chain.thin_w)} kW")
+        lines.append(f"less than {THIN_ROW_STEPS * dt_s:g} s of data at {_kilowatts(chain.thin_w, chain.power_w)} kW")
     if chain.clipped > 0.01:
         lines.append(f"{chain.clipped:.1%} of the demand lies outside the power axis and counts as its end")
     return lines
 
 
-def _kilowatts(values: np.ndarray[Any, Any]) -> str:
-    return ", ".join(f"{value / 1000.0:g}" for value in values)
+def _kilowatts(values: np.ndarray[Any, Any], axis: np.ndarray[Any, Any]) -> str:
+    """Points of an axis, W; neighbours as a range."""
+    runs = np.split(values, np.flatnonzero(np.diff(np.searchsorted(axis, values)) > 1) + 1)
+    return ", ".join(" to ".join(f"{value / 1000.0:g}" for value in dict.fromkeys((run[0], run[-1]))) for run in runs)
 
 
 def _silent(_: str) -> None:

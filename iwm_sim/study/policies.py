@@ -76,8 +76,11 @@ class PolicySource:
         on_grid = f" on grid {self._grid}" if self._grid else ""
         problem = f"{self._given}: holds no policy for '{vehicle.name}' with idle_drive {vehicle.idle_drive}{on_grid}"
         if not self._may_solve:
-            held = ", ".join(sorted({p.idle_drive for p in bank.values() if p.vehicle_name == vehicle.name}))
+            same = [policy for policy in bank.values() if policy.vehicle_name == vehicle.name]
+            held = ", ".join(sorted({policy.idle_drive for policy in same}))
             held = f" (it has some with idle_drive {held})" if held not in ("", vehicle.idle_drive) else ""
+            if any(policy.idle_drive == vehicle.idle_drive and policy.vehicle_hash != vehicle.hash for policy in same):
+                held = " (it has some from before a number of the car changed)"
             raise PolicyError(f"{problem}{held}; solve one with solve_policy")
         return solved(vehicle, friction, self._grid or DEFAULT_GRID, self._say, because=problem)
 

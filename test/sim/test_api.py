@@ -40,6 +40,8 @@ def test_a_share_map_has_the_axes_of_its_policy_and_a_picture(bank):
     figure = api.plot_share(policy)
     assert figure.axes[0].get_ylabel() == "Power demand, kW"
     assert "idle drive drag" in figure.axes[0].get_title()
+    with pytest.raises(ConfigError, match="previous_share: 5 is out of range; allowed: 0 to 1"):
+        api.plot_share(policy, previous_share=5)
 
 
 def test_a_printed_policy_is_one_line_that_says_which_it_is(bank):
@@ -55,6 +57,11 @@ def test_a_drive_gives_metrics_a_saving_and_a_frame(car, bank):
     equal = api.drive("nycc", car, 0.9, strategy="equal", until_s=60.0)
     assert (ours.strategy, equal.strategy) == ("sdp_lookahead", "equal")
     assert ours.saving_percent(equal) > 0.0
+    assert np.isnan(ours.saving_percent(api.drive("nycc", car, 0.9, until_s=50.0)))
+    with pytest.raises(IwmError, match=r"one drive has friction 0\.9, the other 0.5"):
+        ours.saving_percent(api.drive("nycc", car, 0.5, until_s=60.0))
+    with pytest.raises(IwmError, match="one drive has cycle nycc, the other udds"):
+        ours.saving_percent(api.drive("udds", car, 0.9, until_s=60.0))
     assert set(ours.columns()) == set(COLUMNS)
     pd = pytest.importorskip("pandas")
     frame = ours.frame()

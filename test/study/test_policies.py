@@ -7,6 +7,7 @@ import pytest
 
 from iwm_power_manager.errors import IwmError, PolicyError
 from iwm_power_manager.policy import load_policy
+from iwm_power_manager.vehicle import with_params
 from iwm_sim.study import policies
 from iwm_sim.study.cases import vehicle_of
 from iwm_sim.study.policies import PolicySource
@@ -29,6 +30,10 @@ def test_a_folder_is_searched_with_its_subfolders_and_other_cars_do_not_count(tm
     words = r"holds no policy for 'jalalmaab_2015' with idle_drive drag \(it has some with idle_drive none\); solve one"
     with pytest.raises(PolicyError, match=words):
         source.find(vehicle_of(VEHICLE, "drag"), 0.5)
+    car = vehicle_of(VEHICLE, "none")
+    heavier = car.params._replace(chassis=car.params.chassis._replace(mass_kg=1000.0))
+    with pytest.raises(PolicyError, match=r"\(it has some from before a number of the car changed\); solve one"):
+        source.find(with_params(car, car.name, heavier), 0.5)
 
 
 def test_a_file_that_was_named_has_to_fit(small_policy):

@@ -86,6 +86,12 @@ def test_a_gap_is_bridged_or_cut_by_choice_and_never_in_silence(tmp_path, capsys
     assert "<!-- bridged -->" not in svg.read_text()
     assert "cut out" in out
     assert NYCC.duration_s - 52 < load_cycle(output).duration_s < NYCC.duration_s - 40
+    times, speeds = np.concatenate((NYCC.time_s, NYCC.time_s + 1200.0)), np.tile(NYCC.speed_mps, 2)
+    moving = (times < 180.0) | (times > 1200.0)
+    longer = log_of(tmp_path / "longer.csv", ("time_s", "speed m/s"), zip(times[moving], speeds[moving], strict=True))
+    warning = "km are straight lines over gaps that nobody drove"
+    assert warning in run(capsys, longer, "--output", output, "--gaps", "bridge")[2]
+    assert warning not in run(capsys, longer, "--output", output, "--gaps", "cut")[2]
     code, out, _ = run(capsys, log, "--output", output, "--max-gap", "60")
     assert "1 gap of up to 52 s bridged (--max-gap)" in out
 

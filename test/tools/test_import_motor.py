@@ -85,8 +85,12 @@ def test_units_of_both_axes_stand_in_the_corner_of_a_matrix(tmp_path, capsys):
     assert (code, err) == (0, "")
     assert "speeds in rpm, as the header says" in out
     same(tmp_path / "map.csv")
-    err = run(capsys, table, "--output", tmp_path / "map.csv")[2]
-    assert r"although the corner says 'torque_nm\\speed_rpm': --down torque?" in err
+    code, out, err = run(capsys, table, "--output", tmp_path / "map.csv")
+    assert (code, err) == (0, "")
+    assert r"torques down: the corner says 'torque_nm\speed_rpm'" in out
+    same(tmp_path / "map.csv")
+    err = run(capsys, table, "--output", tmp_path / "map.csv", "--down", "speed")[2]
+    assert r"although the corner says 'torque_nm\speed_rpm'" in err
 
 
 def test_losses_become_efficiencies(tmp_path, capsys):
@@ -194,10 +198,15 @@ def test_points_on_no_grid_and_a_header_in_percent_are_warned_of(tmp_path, capsy
 
 
 def test_speeds_taken_for_torques_are_warned_of(tmp_path, capsys):
-    (tmp_path / "sheet.csv").write_text("Nm;1000;3000;6000;9000\n10;80;85;86;85\n30;82;87;88;86\n60;80;86;87;85\n")
+    sheet = ";1000;3000;6000;9000\n10;80;85;86;85\n30;82;87;88;86\n60;80;86;87;85\n"
+    (tmp_path / "sheet.csv").write_text(sheet)
     code, _, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "map.csv")
     assert code == 0
-    assert "torques up to 9000 N m at the motor: --down torque?" in err
+    assert "torques up to 9000 N m at the motor: --down?" in err
+    (tmp_path / "sheet.csv").write_text("Nm" + sheet)
+    code, out, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "map.csv")
+    assert (code, err) == (0, "")
+    assert "torques down: the corner says 'Nm'" in out
 
 
 def test_a_unit_that_contradicts_the_header_is_warned_of(tmp_path, capsys):

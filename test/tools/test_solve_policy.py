@@ -243,8 +243,11 @@ def test_thin_and_missing_data_is_warned_about(tmp_path, grid, capsys):
     calm.write_text("time_s,speed_mps\n0,10\n60,10\n65,14\n")
     assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "a.npz", "--quiet", cycle=calm) == 0
     warnings = capsys.readouterr().err
-    assert "no data at -12, -9, -6, -3, 3, 6, 15, 18 kW" in warnings
-    assert "less than 10 s of data at 9, 12 kW" in warnings
+    assert "no data at -12 to -3, 3 to 6, 15 to 18 kW" in warnings
+    assert "less than 10 s of data at 9 to 12 kW" in warnings
+    assert "replaces" not in warnings
+    assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "a.npz", "--quiet", cycle=calm) == 0
+    assert f"note: replaces {tmp_path}/a.npz" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
