@@ -9,6 +9,7 @@ import numpy as np
 
 from iwm_sim.study import labels, paper
 from iwm_sim.study.content import Study
+from iwm_sim.study.report import format_value
 from iwm_sim.study.rows import Place, Row, by_place, most_saved
 
 #: Where no strategy saves as much as this, %, nothing helps.
@@ -85,12 +86,13 @@ def _program(study: Study) -> str:
     alone = ahead.saving_percent[place] if ahead else None
     text = (
         f"As printed, on its grid ({labels.PAPER_SDP}), it saves in {gains} of {len(found)} cells "
-        f"({min(found):.2f} to {max(found):.2f} %)."
+        f"({format_value(min(found), 2)} to {format_value(max(found), 2)} %)."
     )
     if ahead and alone is not None:
         text += (
             f" What costs it most is interpolating shares between grid points: one step ahead on the same cost-to-go "
-            f"saves {alone:.2f} % instead of {printed[place]:.2f} %, at {ahead.changes_per_min[place]:.0f} changes of "
+            f"saves {format_value(alone, 2)} % instead of {format_value(printed[place], 2)} %, at "
+            f"{ahead.changes_per_min[place]:.0f} changes of "
             f"the split a minute ({place}, idle drive none)."
         )
     return text

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from iwm_sim.study import ablation, battery_fit, paper
@@ -116,11 +116,11 @@ def _metric(label: str, name: str) -> Callable[[Cell], Any]:
     return lambda by: getattr(by[label].metrics, name)
 
 
-def _trace(labels: Iterable[str] | None = None) -> Column[Cell]:
-    """Whether the trace was held by all of these labels, or by all there are."""
+def _trace(labels: Iterable[str] | None = None, names: Mapping[str, str] | None = None) -> Column[Cell]:
+    """Whether the trace was held by all of these labels, or by all there are; `names` are what the table calls them."""
 
     def value(by: Cell) -> str:
-        lost = [label for label in labels or by if not by[label].metrics.trace_held]
+        lost = [(names or {}).get(label, label) for label in labels or by if not by[label].metrics.trace_held]
         return f"lost: {', '.join(lost)}" if lost else "held"
 
     return Column("trace", value)
@@ -271,7 +271,7 @@ def table_6(rows: Sequence[Row]) -> Iterator[TableOf]:
         ("rms_jerk_mps3", "jerk", "m/s³", 1),
     ):
         columns += [Column(kind, _metric(label, name), unit, decimals, group=text) for label, kind in labels.items()]
-    columns.append(_trace(labels))
+    columns.append(_trace(labels, labels))
     for idle_drive, meaning in IDLE_DRIVES.items():
         yield TableOf(
             TABLE_6,

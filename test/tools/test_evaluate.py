@@ -292,7 +292,7 @@ def test_a_frontier_is_printed_drawn_and_written_with_what_it_was_made_with(hill
     assert f"jalalmaab_2015 on hill, {made_with}" in shown
     assert [line.split() for line in shown.splitlines() if line.startswith(("instantaneous_slip ", "sdp_look"))] == [
         ["instantaneous_slip", "60", "W", "5.5", "6.5", "4.4", "7", "0.410", "held"],
-        ["sdp_lookahead", "8", "changes/min", "5.2", "6.1", "4.3", "7", "0.470", "held", "coupled", "12345678"],
+        ["sdp_lookahead", "8", "a", "minute", "5.2", "6.1", "4.3", "7", "0.470", "held", "coupled", "12345678"],
     ]
     (cell,) = json.loads(out.read_text())["cells"]
     assert cell["made_with"] == made_with and cell["ours"][0]["policy"] == "coupled 12345678"
