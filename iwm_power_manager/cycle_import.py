@@ -131,7 +131,7 @@ def read_log(
     left_out = 0
     for line, cells in table.rows[1:]:
         row = {name: cells[i] if i < len(cells) else "" for name, i in columns.items()}
-        if any(text.lower() in ("", "nan", "null", "none", "-", "n/a", "na") for text in row.values()):
+        if any(map(_is_nothing, row.values())):
             left_out += 1
             continue
         for name, text in row.items():
@@ -152,7 +152,8 @@ def read_log(
         rising = _rising(path, arrays["time"], clock, said)
         arrays = {name: x[rising] for name, x in arrays.items()}
     if arrays["time"].size < 2:
-        raise ConfigError(path, "", f"has {arrays['time'].size} usable rows", "two or more")
+        problem = f"has {arrays['time'].size} usable rows: {'; '.join(said)}"
+        raise ConfigError(path, "", problem, "two or more")
     if np.max(np.abs(arrays["grade"])) > MAX_GRADE:
         problem = f"{header[columns['grade']]} reaches {np.max(np.abs(arrays['grade'])):g}: percent or degrees?"
         raise ConfigError(path, "", problem, f"rise over run, -{MAX_GRADE:g} to {MAX_GRADE:g}")
@@ -180,13 +181,25 @@ def _rising(path: Path | str, time: FloatArray, clock: bool, said: list[str]) ->
 def _column(
     table: Table, header: list[str], what: str, name: str, pattern: str, units: dict[str, str] | None = None
 ) -> int:
-    """Index of a column: the one that is named, else the first that looks like it, rather one that names a unit."""
+    """Index of a column: the one that is named, else the first that looks like it, rather one that names a unit.
+
+    One that is empty is the last choice.
+    """
     wanted = [i for i, cell in enumerate(header) if (cell == name if name else re.search(pattern, cell, re.IGNORECASE))]
-    wanted.sort(key=lambda i: not _named(header[i], units or {}))
+    wanted.sort(key=lambda i: (all(map(_is_nothing, _cells(table, i))), not _named(header[i], units or {})))
     if not wanted:
         problem = f"has no column {name!r}" if name else f"has no column that looks like {what}: name it with --{what}"
         raise ConfigError(table.path, "line 1", problem, ", ".join(header))
     return wanted[0]
+
+
+def _is_nothing(text: str) -> bool:
+    return text.lower() in ("", "nan", "null", "none", "-", "n/a", "na")
+
+
+def _cells(table: Table, column: int) -> list[str]:
+    """What stands below a column's name."""
+    return [cells[column] for _, cells in table.rows[1:] if column < len(cells)]
 
 
 def _is_clock(rows: list[tuple[int, list[str]]], column: int) -> bool:

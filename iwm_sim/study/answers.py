@@ -155,6 +155,7 @@ WORDS = {
     "ED, equal": "equal distribution: half of the demand to each axle",
     "GRDP, rule": "the paper's generalized rule: straight lines fitted to dynamic programming on FTP-75",
     "paper_sdp": "the paper's stochastic program on the paper's grid, decided every 0.1 s",
+    "paper_sdp_ungated, paper_sdp_table2": "the same without skid avoidance, and with it as Table 2 prints it",
     "ours": "strategy sdp_lookahead: one step ahead on the cost-to-go of grid coupled, decided every 0.02 s",
     "preview": "dynamic programming with the whole cycle known in advance; its budget or price of changes is beside it",
     "possible": labels.POSSIBLE,

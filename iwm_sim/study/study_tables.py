@@ -430,7 +430,7 @@ def sensitivity_table(study: Study) -> TableOf:
         Column("Case", lambda row: row.case),
         Column("Front share of least depletion", lambda row: row.share, "", 2),
     )
-    note = "At shares 0 and 1 of equal slips the depletion is the same."
+    note = "At shares 0 and 1 of equal slips it is the same. In the figures: full circle, least; open, one axle alone."
     return TableOf(SENSITIVITY, "", columns, rows, note)
 
 

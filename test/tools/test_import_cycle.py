@@ -64,6 +64,16 @@ def test_semicolons_decimal_commas_clocks_and_empty_cells_are_read(tmp_path, cap
     assert json.loads((tmp_path / "n.json").read_text())["speed_unit"] == "km/h"
 
 
+def test_a_column_of_time_that_is_empty_is_the_last_choice(tmp_path, capsys):
+    rows = [("-", t, 3.6 * t) for t in range(10)]
+    log = log_of(tmp_path / "log.csv", ("GPS Time", "Device Time", "Speed (km/h)"), rows)
+    code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv", "--time-unit", "s")
+    assert code == 0
+    assert "time is 'Device Time'" in out
+    error = run(capsys, log, "--output", tmp_path / "trip.csv", "--time", "GPS Time")[2]
+    assert "has 0 usable rows: columns: time is 'GPS Time', speed is 'Speed (km/h)'; 10 rows without a value" in error
+
+
 def test_a_gap_is_bridged_or_cut_by_choice_and_never_in_silence(tmp_path, capsys):
     keep = (NYCC.time_s < 200) | (NYCC.time_s > 250)
     log = log_of(
