@@ -4,8 +4,8 @@
     python benchmarks/bags.py                 all but the recording over DDS
     python benchmarks/bags.py --dds 10        with 10 s of 5 topics at 1 kHz into a real recorder
 
-Everything is measured in one run, the contenders in turns, the best of several rounds counts: what is left out are
-pauses of the machine, which hit everybody.
+Everything is measured in one run, the contenders in turns, the median of several rounds counts. All write the same
+messages, made beforehand.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -34,7 +34,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from iwm_power_manager.bags.metadata import DEFAULT_QOS, Topic
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.recording import Recording
-from iwm_power_manager.bags.writer import BagWriter, WriterOptions
+from iwm_power_manager.bags.writer import BagWriter, Sample, WriterOptions
 from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.run import Replay, ReplayOutput
 from iwm_power_manager.signals.contract import WHEEL_NAMES
@@ -45,8 +45,9 @@ from iwm_power_manager.signals.types import definition_of, standard_types
 TWIST, FLOAT64 = "geometry_msgs/msg/TwistStamped", "std_msgs/msg/Float64"
 TOPICS = 5
 ROUNDS = 7
-#: Messages the recorder's node hands over at a time: 20 ms of 5 topics at 1 kHz.
-BATCH = 100
+#: Messages the recorder's node hands over at a time: 20 ms of 5 topics at 1 kHz; and batches that wait at most, more
+#: than ever do there.
+BATCH, WAITING = 100, 10
 MESSAGES = [
     joint_state_writer(WHEEL_NAMES, "effort")(i * 1_000_000, [math.sin(i + k) * 100.0 for k in range(4)])
     for i in range(1000)
@@ -96,6 +97,7 @@ def _write(folder: Path, count: int) -> dict[str, float]:
     definition = definition_of(JOINT_STATE)
     reference = "rosbags, none"
     contenders: dict[str, Callable[[], int]] = {}
+    samples = [(i % TOPICS + 1, i * 200_000, MESSAGES[i % 1000], i * 200_000, i) for i in range(count)]
 
     def fresh(suffix: str = "") -> Path:
         path = folder / f"bag{suffix}"
@@ -109,24 +111,19 @@ def _write(folder: Path, count: int) -> dict[str, float]:
 
     def ours(compression: str) -> int:
         with BagWriter(fresh(), WriterOptions(compression=compression)) as bag:
-            numbers = topics(bag.add_topic)
-            bag.write_all((numbers[i % TOPICS], i * 200_000, MESSAGES[i % 1000], i * 200_000, i) for i in range(count))
+            topics(bag.add_topic)
+            bag.write_all(iter(samples), max(map(len, MESSAGES)))
         return count
 
     def recorder_path() -> int:
         """All the recorder's node does with a message it has taken: queue, thread, flush by time, wait for the disk."""
         recording = Recording(fresh())
         recording.start()
-        numbers = topics(recording.add_topic)
+        topics(recording.add_topic)
         for first in range(0, count, BATCH):
-            recording.put(
-                [
-                    (numbers[i % TOPICS], i * 200_000, MESSAGES[i % 1000], i * 200_000, i)
-                    for i in range(first, first + BATCH)
-                ]
-            )
-            while recording.status().queue_bytes > 32_000_000:
-                time.sleep(0.001)
+            recording.put(samples[first : first + BATCH])
+            if first % (BATCH * WAITING) == 0:
+                recording.call(lambda: None)  # until all of that is written
         recording.close()
         if recording.status().written != count:
             raise RuntimeError(f"wrote {recording.status().written} of {count} messages")
@@ -139,18 +136,18 @@ def _write(folder: Path, count: int) -> dict[str, float]:
             connections = [
                 writer.add_connection(f"/topic_{i}", JOINT_STATE, typestore=standard_types()) for i in range(TOPICS)
             ]
-            for i in range(count):
-                writer.write(connections[i % TOPICS], i * 200_000, MESSAGES[i % 1000])
+            for topic, time_ns, data, _, _ in samples:
+                writer.write(connections[topic - 1], time_ns, data)
         return count
 
     contenders[reference] = lambda: rosbags(CompressionMode.NONE)
     contenders["rosbags, zstd"] = lambda: rosbags(CompressionMode.STORAGE)
-    contenders["mcap (Python), zstd"] = lambda: _mcap_package(fresh(".mcap"), definition[0], count)
+    contenders["mcap (Python), zstd"] = lambda: _mcap_package(fresh(".mcap"), definition[0], samples)
     try:
         import foxglove  # noqa: F401
 
         contenders["foxglove-sdk (Rust), zstd, bare .mcap"] = lambda: _foxglove_sdk(
-            fresh(".mcap"), definition[0], count
+            fresh(".mcap"), definition[0], samples
         )
     except ImportError:
         print("foxglove-sdk is not installed: left out")
@@ -160,7 +157,7 @@ def _write(folder: Path, count: int) -> dict[str, float]:
     return _medians(contenders, reference, f"write {count} JointStates, {TOPICS} topics")
 
 
-def _mcap_package(path: Path, definition: str, count: int) -> int:
+def _mcap_package(path: Path, definition: str, samples: Sequence[Sample]) -> int:
     from mcap.writer import CompressionType
     from mcap.writer import Writer as McapWriter
 
@@ -169,13 +166,13 @@ def _mcap_package(path: Path, definition: str, count: int) -> int:
         writer.start("ros2")
         schema = writer.register_schema(JOINT_STATE, "ros2msg", definition.encode())
         channels = [writer.register_channel(f"/topic_{i}", "cdr", schema) for i in range(TOPICS)]
-        for i in range(count):
-            writer.add_message(channels[i % TOPICS], i * 200_000, MESSAGES[i % 1000], i * 200_000, i)
+        for topic, time_ns, data, sent_ns, sequence in samples:
+            writer.add_message(channels[topic - 1], time_ns, data, sent_ns, sequence)
         writer.finish()
-    return count
+    return len(samples)
 
 
-def _foxglove_sdk(path: Path, definition: str, count: int) -> int:
+def _foxglove_sdk(path: Path, definition: str, samples: Sequence[Sample]) -> int:
     import foxglove
 
     context = foxglove.Context()
@@ -185,9 +182,9 @@ def _foxglove_sdk(path: Path, definition: str, count: int) -> int:
             foxglove.Channel(f"/topic_{i}", schema=schema, message_encoding="cdr", context=context)
             for i in range(TOPICS)
         ]
-        for i in range(count):
-            channels[i % TOPICS].log(MESSAGES[i % 1000], log_time=i * 200_000)
-    return count
+        for topic, time_ns, data, _, _ in samples:
+            channels[topic - 1].log(data, log_time=time_ns)
+    return len(samples)
 
 
 # --- reading and replaying ------------------------------------------------------------------------------------------

@@ -11,8 +11,10 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import mcap.records
 import yaml
-from mcap.writer import CompressionType, Writer
+from mcap.data_stream import RecordBuilder
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 COUNT = 100
 PERIOD_NS = 20_000_000
@@ -155,6 +157,45 @@ def write_mcap(
         for sequence, (log_ns, number, data) in enumerate(entries, 1):
             writer.add_message(numbers[number], log_ns, data, max(log_ns - 500, 0), sequence)
         writer.finish()
+    return path
+
+
+def record(content: Any) -> bytes:
+    """A record of the `mcap` package as bytes."""
+    builder = RecordBuilder()
+    content.write(builder)
+    return bytes(builder.end())
+
+
+def announced(channels: Iterable[Channel] = CHANNELS) -> bytes:
+    """Records of schemas and channels, numbered from 1 on."""
+    return b"".join(
+        record(mcap.records.Schema(id=i, name=channel.type, encoding=channel.encoding, data=channel.text.encode()))
+        + record(mcap.records.Channel(i, channel.topic, channel.serialization, {}, i))
+        for i, channel in enumerate(channels, 1)
+    )
+
+
+def message_records(entries: Iterable[Entry]) -> bytes:
+    """Records of messages."""
+    return b"".join(
+        record(mcap.records.Message(number + 1, log_ns, data, log_ns, i))
+        for i, (log_ns, number, data) in enumerate(entries)
+    )
+
+
+def chunk(records: bytes, compression: str = "", packed: bytes | None = None) -> bytes:
+    """A chunk without a checksum; `packed` is what stands in it."""
+    content = records if packed is None else packed
+    return record(mcap.records.Chunk(compression, content, START_NS, START_NS, 0, len(records)))
+
+
+def write_records(path: Path, *parts: bytes) -> Path:
+    """A whole MCAP file, without a summary, of such records."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    head = record(mcap.records.Header("ros2", "foreign"))
+    end = record(mcap.records.DataEnd(0)) + record(mcap.records.Footer(0, 0, 0))
+    path.write_bytes(b"".join([MCAP0_MAGIC, head, *parts, end, MCAP0_MAGIC]))
     return path
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import shutil
 import stat
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,8 @@ MAX_CHUNK_BYTES = 256 * _MEBIBYTE
 #: What is decompressed, by what it was decompressed from; small things may be more.
 MAX_RATIO = 1000
 FREE_BYTES = 16 * _MEBIBYTE
+#: Frames of lz4 in one chunk: what is behind each is copied.
+MAX_LZ4_FRAMES = 64
 #: Messages in one chunk, and the memory of those that wait for chunks that overlap theirs in time.
 MAX_CHUNK_MESSAGES = 1_000_000
 MAX_OVERLAP_BYTES = 512 * _MEBIBYTE
@@ -32,6 +35,8 @@ MESSAGE_OVERHEAD_BYTES = 250
 #: Records at the top of one file, and channels in it.
 MAX_RECORDS = 20_000_000
 MAX_CHANNELS = 10_000
+#: Lines about what is wrong with one file.
+MAX_NOTES = 100
 #: `metadata.yaml`, the same text inside of a file, and one profile of quality of service.
 MAX_METADATA_BYTES = 4 * _MEBIBYTE
 MAX_QOS_BYTES = 64 * 1024
@@ -88,7 +93,7 @@ def decompress(compression: str, data: bytes, size: int | None = None) -> bytes:
     most = min(MAX_CHUNK_BYTES, FREE_BYTES + MAX_RATIO * len(data))
     if size is not None and size > most:
         raise BagError(f"{len(data)} bytes say they hold {size}; allowed: <= {most}")
-    raw = _decompressed(compression, data, most + 1 if size is None else size + 1)
+    raw = _decompressed(compression, data, most + 1 if size is None else size + 1, size)
     if len(raw) > most:
         raise BagError(f"{len(data)} bytes hold more than {most}")
     if (len(raw) != size) if size is not None else not raw:
@@ -96,7 +101,7 @@ def decompress(compression: str, data: bytes, size: int | None = None) -> bytes:
     return raw
 
 
-def _decompressed(compression: str, data: bytes, most: int) -> bytes:
+def _decompressed(compression: str, data: bytes, most: int, size: int | None) -> bytes:
     import lz4.frame
     import zstandard
 
@@ -104,10 +109,19 @@ def _decompressed(compression: str, data: bytes, most: int) -> bytes:
         if compression == "":
             return data[:most]
         if compression == "lz4":
-            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most))
-        if compression == "zstd" and 0 <= zstandard.frame_content_size(data) < most:
-            return bytes(_zstd().decompress(data))  # allocates what the frame says, which is allowed
+            raw, rest = b"", data
+            for _ in range(MAX_LZ4_FRAMES):
+                decoder = lz4.frame.LZ4FrameDecompressor()
+                raw += decoder.decompress(rest, max_length=most - len(raw))
+                rest = decoder.unused_data or b""
+                if not rest or len(raw) == most:
+                    break
+            return raw
         if compression == "zstd":
+            stated = zstandard.frame_content_size(data)
+            if 0 <= stated < most:
+                with suppress(zstandard.ZstdError):  # allocates what the frame says, which is allowed
+                    return bytes(_zstd().decompress(data, allow_extra_data=stated == size))
             with _zstd().stream_reader(io.BytesIO(data), read_across_frames=True) as reader:
                 return bytes(reader.read(most))
     except (RuntimeError, EOFError, MemoryError, zstandard.ZstdError):
@@ -141,7 +155,7 @@ def decompress_file(path: Path, target: Path) -> str:
             target.open("xb") as sink,
             _zstd().stream_reader(source, read_across_frames=True) as reader,
         ):
-            while piece := reader.read(1 << 20):
+            while piece := reader.read1(1 << 20):  # `read` would lose what stands before a damaged place
                 written += len(piece)
                 if written > most:
                     raise BagError(f"{path}: holds more than {most} bytes, from {size}")

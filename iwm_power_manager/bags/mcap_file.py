@@ -16,7 +16,9 @@ import errno
 import os
 import struct
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import IO, cast
 
@@ -46,6 +48,7 @@ class McapFile:
     Attributes
     ----------
     writer : the package's, which takes messages, definitions and metadata
+    schema_id : its `register_schema`, which gives the same id for the same schema
     stream : the file itself, unbuffered
     size_bytes : what is in the file so far
     counts, start_time_ns, end_time_ns : messages by channel, and their log times, in the file; 0 while there are none
@@ -68,10 +71,10 @@ class McapFile:
         self.counts: Counter[int] = Counter()
         self.broken = False
         self._chunk = b""
-        self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self.writer = Writer(
             cast("IO[bytes]", self), chunk_size=chunk_bytes, compression=CompressionType[compression.upper()]
         )
+        self.schema_id: Callable[[str, str, bytes], int] = cache(self.writer.register_schema)
         self.stream: IO[bytes] = open(path, "xb", buffering=0)  # noqa: SIM115 - closed by finish() or abandon()
         try:
             self.writer.start(profile, library)
@@ -83,13 +86,6 @@ class McapFile:
     def span(self) -> FileSpan:
         """Name, log times and number of messages in the file."""
         return FileSpan(self.path.name, self.start_time_ns, self.end_time_ns, self.counts.total())
-
-    def schema_id(self, name: str, encoding: str, data: bytes) -> int:
-        """Id of a schema, the same for the same schema."""
-        key = (name, encoding, data)
-        if key not in self._schema_ids:
-            self._schema_ids[key] = self.writer.register_schema(name, encoding, data)
-        return self._schema_ids[key]
 
     def write(self, data: bytes) -> int:
         """Take whole records; a chunk waits for the index of its messages, which comes next."""

@@ -23,7 +23,7 @@ import struct
 import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from io import BytesIO
 from itertools import count
@@ -70,11 +70,14 @@ _KINDS: dict[int, Any] = {
     Opcode.STATISTICS: Statistics,
 }
 
+#: How the notes of what cannot be carried over begin.
+LEFT_OUT = "left out"
+
 #: Opcode of what is no record.
 UNREADABLE = 0
 
 Bytes = bytes | mmap.mmap
-_SPAN = struct.Struct("<QQ")
+_CHUNK_HEAD = struct.Struct("<QQQ")  # first and last log time, uncompressed size
 #: Messages that stand outside of chunks are read in pieces of about this size.
 _RUN_BYTES = 1024 * 1024
 _NEVER = 2**64
@@ -162,18 +165,20 @@ def _is_begin(data: Bytes, start: int) -> bool:
 
 
 class Definitions:
-    """Schemas and channels by their numbers, as they are met."""
+    """Schemas and channels by their numbers, as they are met; `note` is told what is wrong with them."""
 
-    def __init__(self) -> None:
+    def __init__(self, note: Callable[[str], object] = str) -> None:
+        self.note = note
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
 
     def take(self, found: Schema | Channel) -> None:
         """Add one; the first of a number counts. `BagError` if there are too many."""
         known: dict[int, Any] = self.schemas if isinstance(found, Schema) else self.channels
-        known.setdefault(found.id, found)
-        if len(known) > limits.MAX_CHANNELS:
+        if len(known) >= limits.MAX_CHANNELS and found.id not in known:
             raise BagError(f"holds more than {limits.MAX_CHANNELS} channels")
+        if known.setdefault(found.id, found) != found:
+            self.note(f"announces {type(found).__name__.lower()} {found.id} in more than one way: the first counts")
 
     def schema_of(self, channel: Channel) -> Schema:
         """A channel's schema; an empty one where there is none."""
@@ -193,7 +198,10 @@ def _read(kind: Any, data: Bytes, record: Record) -> Any:
 
 
 def split(raw: bytes, definitions: Definitions) -> list[ChannelMessage]:
-    """The messages of an uncompressed chunk, as far as its records make sense; what it announces is added."""
+    """The messages of an uncompressed chunk, as far as its records make sense; what it announces is added.
+
+    What is left out is told to the definitions' `note`.
+    """
     messages: list[ChannelMessage] = []
     append, unpack = messages.append, _MESSAGE.unpack_from
     offset, size = 0, len(raw)
@@ -212,7 +220,11 @@ def split(raw: bytes, definitions: Definitions) -> list[ChannelMessage]:
                 break
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 definitions.take(_read(_KINDS[opcode], raw, Record(opcode, offset, offset + HEAD_BYTES, end)))
+            else:
+                definitions.note(f"{LEFT_OUT}: records in a chunk that belong outside of it, as one of kind {opcode}")
         offset = end
+    if offset < size:
+        definitions.note(f"{LEFT_OUT}: {size - offset} bytes at the end of a chunk that are no record")
     if len(messages) > limits.MAX_CHUNK_MESSAGES:
         raise BagError(f"holds more than {limits.MAX_CHUNK_MESSAGES} messages")
     return messages
@@ -253,12 +265,13 @@ class McapSource:
     def __init__(self, path: Path, stack: ExitStack) -> None:
         self.path = path
         self.damage: list[str] = []
-        self.definitions = Definitions()
+        self.definitions = Definitions(self.note)
         self.counts: Counter[int] = Counter()
         self.metadata: dict[str, dict[str, str]] = {}
         self.header = Header(profile="ros2", library="")
         self.start_ns = self.end_ns = 0
         self._pieces: list[Piece] = []
+        self._too_much_at = _NEVER  # byte from which on chunks are not unpacked
         if limits.regular_file(path) == 0:
             raise BagError(f"{path}: is empty")
         try:
@@ -266,9 +279,10 @@ class McapSource:
                 self.data: Any = stack.enter_context(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
         except OSError as error:
             raise BagError(f"{path}: cannot be read: {error.strerror or error}") from None
-        if self.data[: len(MAGIC)] != MAGIC:
-            raise BagError(f"{path}: is no MCAP file")
+        begins = self.data[: len(MAGIC)] == MAGIC
         statistics = self._survey()
+        if not (begins or self._pieces):
+            raise BagError(f"{path}: is no MCAP file")
         self.information = information_of(self.metadata.get("rosbag2", {}).get("serialized_metadata", ""))
         own = self.metadata.get(CUSTOM_METADATA, {})
         self.custom_data = text_values(self.information.get("custom_data")) | own
@@ -302,11 +316,15 @@ class McapSource:
     def _survey(self) -> Statistics | None:
         """Go through all records; returns the summary's statistics, if the file was finished."""
         statistics: Statistics | None = None
-        record = None
+        record, unpacked = None, 0
         for record in self.records():
             found = record.content
             if record.opcode == Opcode.CHUNK:
-                self._pieces.append(Piece(_SPAN.unpack_from(self.data, record.body)[0], record))
+                start_ns, _, size = _CHUNK_HEAD.unpack_from(self.data, record.body)
+                self._pieces.append(Piece(start_ns, record))
+                unpacked += size if size <= limits.MAX_CHUNK_BYTES else 0  # more is refused by itself
+                if unpacked > limits.MAX_CHUNK_BYTES + limits.MAX_RATIO * len(self.data):
+                    self._too_much_at = min(self._too_much_at, record.start)
             elif record.opcode == Opcode.MESSAGE:
                 self._add_to_run(record)
             elif record.opcode == UNREADABLE and record.end < len(self.data):
@@ -323,6 +341,8 @@ class McapSource:
                     self.definitions.take(found)
                 except BagError as error:
                     self.note(f"{error} at byte {record.start}")
+        if self.data[: len(MAGIC)] != MAGIC:
+            self.note("does not begin as an MCAP file")
         if record is None or record.opcode != Opcode.FOOTER or self.data[record.end :] != MAGIC:
             self.note("ends without a footer: the recorder did not finish it")
             return None
@@ -361,7 +381,8 @@ class McapSource:
         self.start_ns, self.end_ns = min((piece.start_ns for piece in self._pieces), default=0), end_ns
 
     def note(self, line: str) -> None:
-        """Add a line to the damage."""
+        """Add a line to the damage, if there is room for another."""
+        line = line if len(self.damage) < limits.MAX_NOTES else "is damaged at more places"
         if line not in self.damage:
             self.damage.append(line)
 
@@ -405,6 +426,8 @@ class McapSource:
 
     def raw(self, record: Record) -> bytes:
         """Content of a chunk; `BagError` if it is damaged or too large."""
+        if record.start >= self._too_much_at:
+            raise BagError(f"is left out: those before it hold {limits.MAX_RATIO} times what the file has")
         chunk: Chunk = _read(Chunk, self.data, record)
         raw = limits.decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
         if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:

@@ -58,7 +58,7 @@ class BagReader:
 
     Attributes
     ----------
-    topics : recorded topics by name
+    topics : recorded topics by name; where one has several definitions, each after the first has a number behind it
     counts : messages by topic
     custom_data : custom metadata
     start_ns, end_ns : log times the bag spans (0, 0 if it is empty)
@@ -83,6 +83,8 @@ class BagReader:
             self.close()
             raise
         self.topics: dict[str, Topic] = {}
+        self._names: dict[Source, dict[int, str]] = {}  # by the channels of each file
+        self._kinds: dict[str, dict[tuple[str, str], str]] = {}
         self.counts: Counter[str] = Counter()
         self.custom_data = text_values(self.information.get("custom_data"))
         for source in self.sources:
@@ -118,7 +120,7 @@ class BagReader:
             yield from stream
 
     def _messages_of(self, source: Source) -> Iterator[Message]:
-        names = {number: topic.name for number, topic in source.topics().items()}
+        names = self._names[source]
         homeless = unpackable = 0
         for log_time, channel, data, publish_time, sequence in source.messages():
             name = names.get(channel)
@@ -140,12 +142,20 @@ class BagReader:
 
     def _take(self, source: Source) -> None:
         """What a file knows of topics, counts and custom data."""
+        names = self._names[source] = {number: self._name(topic) for number, topic in source.topics().items()}
         for number, topic in source.topics().items():
-            self.counts[topic.name] += source.counts[number]
-            known = self.topics.setdefault(topic.name, topic)
-            if (known.type, known.definition) != (topic.type, topic.definition) and topic.definition:
-                source.note(f"{topic.name} has more than one definition; it is read by the first")
+            self.counts[names[number]] += source.counts[number]
+            if self.topics.setdefault(names[number], topic).name != names[number]:
+                source.note(f"{topic.name} has more than one definition: each message is read by its own")
         self.custom_data = source.custom_data | self.custom_data
+
+    def _name(self, topic: Topic) -> str:
+        """Its own, or, for a definition after the first, one that no other topic can have."""
+        kinds = self._kinds.setdefault(topic.name, {})
+        if kinds and not topic.definition:
+            return topic.name
+        name = f"{topic.name} ({len(kinds) + 1})" if kinds else topic.name
+        return kinds.setdefault((topic.type, topic.definition), name)
 
     def _open_all(self) -> None:
         problems = []
@@ -183,21 +193,22 @@ def recovered(path: Path) -> Path:
 
 def _begins_as_data(path: Path, folder: Path) -> bool:
     """Whether a file is more than what a power cut has left: it begins as one that can be read."""
-    with suppress(BagError, OSError):
+    with suppress(BagError):
         regular_file(path, folder)
-        with path.open("rb") as file:
-            return file.read(len(MAGIC)) in (MAGIC, _SQLITE_MAGIC[: len(MAGIC)]) or path.suffix == COMPRESSED_SUFFIX
+        return path.suffix == COMPRESSED_SUFFIX or _head(path, len(MAGIC)) in (MAGIC, _SQLITE_MAGIC[: len(MAGIC)])
     return False
 
 
 def listed_files(information: Mapping[str, Any]) -> dict[str, None]:
     """Names of the data files that a `metadata.yaml` lists, in its order.
 
-    Older versions put the folder's name in front; what leads elsewhere is looked for in the folder, and is not there.
+    Older versions put the folder's name in front (on Windows with a backslash); what leads elsewhere is looked for in
+    the folder, and is not there.
     """
     listed = information.get("relative_file_paths")
-    names = (PurePosixPath(str(name)).name for name in (listed if isinstance(listed, list) else []))
-    return dict.fromkeys(filter(None, names))
+    listed = listed if isinstance(listed, list) else []
+    names = (PurePosixPath(str(name).replace("\\", "/")).name for name in listed)
+    return dict.fromkeys(name for name in names if name.strip("."))
 
 
 def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside: bool = False) -> tuple[Path, str]:
@@ -209,20 +220,26 @@ def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside
         It is no regular file, lies outside of its `folder`, or cannot be decompressed.
     """
     regular_file(path, folder)
-    if path.suffix != COMPRESSED_SUFFIX:
+    named = path.suffix == COMPRESSED_SUFFIX
+    if not named and _head(path, len(ZSTD_MAGIC)) != ZSTD_MAGIC:
         return path, ""
     where = path.parent if beside else None
     copied = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_bag_", dir=where))) / path.stem
-    return copied, decompress_file(path, copied)
+    return copied, decompress_file(path, copied) or ("" if named else "is compressed, which its name does not say")
+
+
+def _head(path: Path, size: int) -> bytes:
+    """The first bytes of a file; `BagError` if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return file.read(size)
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
 def open_source(opened: Path, path: Path, stack: ExitStack) -> Source:
     """Open a data file, or a copy of the one at `path`, as what it is by its first bytes, else by its name."""
-    try:
-        with opened.open("rb") as file:
-            head = file.read(len(_SQLITE_MAGIC))
-    except OSError as error:
-        raise BagError(f"{path}: cannot be read: {error.strerror or error}") from None
+    head = _head(opened, len(_SQLITE_MAGIC))
     sqlite = head == _SQLITE_MAGIC or (opened.suffix == ".db3" and not head.startswith(MAGIC))
     try:
         source = SqliteSource(opened, stack) if sqlite else McapSource(opened, stack)

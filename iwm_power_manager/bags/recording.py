@@ -138,11 +138,11 @@ class Recording:
     # --- called by anyone -------------------------------------------------------------------------------------------
 
     def add_topic(self, topic: Topic) -> int:
-        """Announce a topic; returns the number its messages carry."""
+        """Announce a topic; returns the number its messages carry, from 1 on."""
         with self._lock:
             self._topic_count += 1
             self._enqueue(partial(self._announce, topic))
-            return self._topic_count - 1
+            return self._topic_count
 
     def add_custom_data(self, values: Mapping[str, str]) -> None:
         """Add to the metadata of this bag and the following ones; does not wait."""
@@ -240,7 +240,7 @@ class Recording:
         remaining = iter(samples)
         while True:
             try:
-                self._writer.write_all(remaining)
+                self._writer.write_all(remaining, size)
                 return
             except MessageTooLarge as error:
                 self._given -= 1
@@ -348,9 +348,8 @@ class Recording:
         path = _free_name(self.path, "snapshot_", self._snapshots)
         try:
             with self._new_bag(path) as bag:
-                bag.write_all(
-                    sample for sample in self._memory if len(sample[2]) <= self.options.writer.max_message_bytes
-                )
+                most = self.options.writer.max_message_bytes
+                bag.write_all((sample for sample in self._memory if len(sample[2]) <= most), most)
         except WriteFailed as error:
             raise BagError(str(error)) from None  # the bag that is being recorded is another
         return path

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Metadata
+from mcap.records import Attachment, Channel, Metadata, Schema
 
 from iwm_power_manager.bags import mcap_source, reader
 from iwm_power_manager.bags.limits import ZSTD_MAGIC, check_exists, regular_file
@@ -216,7 +216,7 @@ class _File:
         try:
             temporary.unlink(missing_ok=True)
             self._stack.callback(temporary.unlink, missing_ok=True)
-            lost, torn = _copy(self.seen.source, temporary)
+            copy = _Copy(self.seen.source, temporary)
             made = _Seen(reader.open_source(temporary, target, self._stack), _Gaps())
         except OSError as error:
             raise BagError(f"{temporary}: cannot be written: {error.strerror or error}") from None
@@ -224,9 +224,9 @@ class _File:
             raise BagError(
                 f"{temporary}: holds {made.count} of {self.seen.count} messages; the original is left as it is"
             )
-        kept = self.path.name if target != self.path else f"{target.name}.damaged" if lost or torn else ""
+        kept = self.path.name if target != self.path else f"{target.name}.damaged" if copy.lost or copy.torn else ""
         what = self.problem or ("is compressed" if self.is_compressed else "is sqlite3 beside MCAP")
-        self.report = FileRecovery(target.name, True, made.count, what, torn, lost, kept)
+        self.report = FileRecovery(target.name, True, made.count, what, copy.torn, copy.lost, kept)
         self.seen, self.path, self._temporary = made, target, temporary
 
     def put_in_place(self) -> None:
@@ -265,56 +265,80 @@ def _opened(path: Path, stack: ExitStack) -> tuple[Path, str]:
     return folder / path.name, "has a journal: the recorder did not finish"
 
 
-def _copy(source: reader.Source, target: Path) -> tuple[int, int]:
-    """Write what can be read of a file to a new MCAP file.
+class _Copy:
+    """What can be read of a file, in a new MCAP file.
 
-    Returns the number of chunks, or stretches, that could not be read, and of torn bytes at its end.
+    Attributes
+    ----------
+    lost : chunks, or stretches, that could not be read, or not all of them
+    torn : bytes at its end
     """
-    lost = torn = 0
-    file = McapFile(target, library=source.header.library or LIBRARY, profile=source.header.profile)
-    writer = file.writer
-    numbers: dict[int, int] = {}  # by the channels of the old file those of the new one
 
-    def write(messages: Iterable[mcap_source.ChannelMessage]) -> None:
+    def __init__(self, source: reader.Source, target: Path) -> None:
+        self.lost = self.torn = 0
+        self._file = McapFile(target, library=source.header.library or LIBRARY, profile=source.header.profile)
+        self._numbers: dict[int, int] = {}  # by the channels of the old file those of the new one
+        self._schemas: dict[int, Schema] = {}
+        self._made: dict[str, int] = {}
+        try:
+            if isinstance(source, SqliteSource):
+                self._numbers |= {number: announce(self._file, topic) for number, topic in source.topics().items()}
+                self._write(source.messages())
+            else:
+                self._define(source.definitions)
+                for record in source.records():
+                    self._carry_over(source, record)
+            self._file.finish()
+        finally:
+            self._file.abandon()
+
+    def _define(self, definitions: mcap_source.Definitions) -> None:
+        """Announce channels; one that is announced anew, and otherwise, is another one from here on."""
+        self._schemas.update(definitions.schemas)
+        for number, channel in definitions.channels.items():
+            schema = self._schemas.get(channel.schema_id)
+            key = self._file.schema_id(schema.name, schema.encoding, schema.data) if schema else 0
+            what = channel.topic, channel.message_encoding, key, channel.metadata
+            name = repr((number, what))
+            if name not in self._made:
+                self._made[name] = self._file.writer.register_channel(*what)
+            self._numbers[number] = self._made[name]
+
+    def _write(self, messages: Iterable[mcap_source.ChannelMessage]) -> None:
+        writer, numbers = self._file.writer, self._numbers
         for log_time, channel, data, publish_time, sequence in messages:
             if channel not in numbers:  # its announcement is lost; what was sent on it is not
                 numbers[channel] = writer.register_channel(f"/recovered/channel_{channel}", "cdr", 0, {})
             writer.add_message(numbers[channel], log_time, data, publish_time, sequence)
 
-    try:
-        if isinstance(source, SqliteSource):
-            numbers |= {number: announce(file, topic) for number, topic in source.topics().items()}
-            write(source.messages())
-        else:
-            for number, channel in source.definitions.channels.items():
-                schema = source.definitions.schema_of(channel)
-                key = file.schema_id(schema.name, schema.encoding, schema.data) if schema.id else 0
-                numbers[number] = writer.register_channel(
-                    channel.topic, channel.message_encoding, key, channel.metadata
-                )
-            for record in source.records():
-                found, raw = record.content, source.data[record.start : record.end]
-                if record.opcode == Opcode.CHUNK:
-                    try:
-                        write(mcap_source.split(source.raw(record), mcap_source.Definitions()))
-                    except BagError:
-                        lost += 1
-                elif record.opcode == Opcode.MESSAGE:
-                    write(mcap_source.split(raw, mcap_source.Definitions()))
-                elif isinstance(found, Attachment):
-                    writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
-                elif isinstance(found, Metadata):
-                    writer.add_metadata(found.name, found.metadata)
-                elif record.opcode >= mcap_source.FIRST_PRIVATE:
-                    file.write(raw)
-                elif record.opcode == mcap_source.UNREADABLE and record.end < len(source.data):
-                    lost += 1
-                elif record.opcode == mcap_source.UNREADABLE:
-                    torn = len(raw)
-        file.finish()
-    finally:
-        file.abandon()
-    return lost, torn
+    def _carry_over(self, source: mcap_source.McapSource, record: mcap_source.Record) -> None:
+        found, raw, writer = record.content, source.data[record.start : record.end], self._file.writer
+        left_out: list[str] = []
+        here = mcap_source.Definitions(left_out.append)
+        if record.opcode == Opcode.CHUNK:
+            try:
+                messages = mcap_source.split(source.raw(record), here)
+            except BagError:
+                self.lost += 1
+                return
+            self.lost += any(line.startswith(mcap_source.LEFT_OUT) for line in left_out)
+            self._define(here)
+            self._write(messages)
+        elif isinstance(found, Schema | Channel):
+            here.take(found)
+            self._define(here)
+        elif record.opcode == Opcode.MESSAGE:
+            self._write(mcap_source.split(raw, here))
+        elif isinstance(found, Attachment):
+            writer.add_attachment(found.create_time, found.log_time, found.name, found.media_type, found.data)
+        elif isinstance(found, Metadata):
+            writer.add_metadata(found.name, found.metadata)
+        elif record.opcode >= mcap_source.FIRST_PRIVATE:
+            self._file.write(raw)
+        elif record.opcode == mcap_source.UNREADABLE and record.end < len(source.data):
+            self.lost += 1
+        elif record.opcode == mcap_source.UNREADABLE:
+            self.torn = len(raw)
 
 
 def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Mapping[str, object]) -> None:

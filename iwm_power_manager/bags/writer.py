@@ -7,25 +7,27 @@ each file carries every schema and the custom metadata, so that each can be read
 
 from __future__ import annotations
 
+import math
 import os
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice, starmap
 from pathlib import Path
 from typing import Any, Self
 
 from iwm_power_manager import __version__
 from iwm_power_manager.bags import metadata
-from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
+from iwm_power_manager.bags.mcap_file import McapFile
 from iwm_power_manager.bags.mcap_source import RECORD_OVERHEAD_BYTES
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.files import atomic_write, sync_folder
 
 #: One message: topic's number, log time (ns, when it was received and what readers sort by), CDR bytes with their
-#: four bytes of encapsulation, publish time (ns, when it was sent), the publisher's counter (0 if unknown).
+#: four bytes of encapsulation, publish time (ns, when it was sent), the publisher's counter (0 if unknown, < 2^32).
 Sample = tuple[int, int, bytes, int, int]
 
 LIBRARY = f"iwm_power_manager {__version__}"
@@ -49,14 +51,6 @@ class WriterOptions:
     max_bytes: int = 0
     max_duration_ns: int = 0
     max_message_bytes: int = 64 * 1024 * 1024
-
-    def __post_init__(self) -> None:
-        if self.compression not in COMPRESSIONS:
-            raise BagError(f"compression: {self.compression!r} is unknown; allowed: {' | '.join(COMPRESSIONS)}")
-        for name, low in (("chunk_bytes", 1024), ("max_bytes", 0), ("max_duration_ns", 0), ("max_message_bytes", 1)):
-            value = getattr(self, name)
-            if value < low:
-                raise BagError(f"{name}: {value} is too small; allowed: >= {low}")
 
 
 class MessageTooLarge(BagError):
@@ -98,8 +92,7 @@ class BagWriter:
         self._disk = disk
         self._disk_work: deque[Future[None]] = deque()
         self._topics: list[metadata.Topic] = []
-        self._counts: list[int] = []
-        self._channels: list[int] = []
+        self._counts: Counter[int] = Counter()  # messages by topic, in closed files
         self._spans: list[metadata.FileSpan] = []
         self._closed = False
         self._closed_bytes = 0
@@ -142,12 +135,10 @@ class BagWriter:
         return len(self._spans) + (1 if self._file else 0)
 
     def add_topic(self, topic: metadata.Topic) -> int:
-        """Announce a topic; returns the number that `write` takes."""
+        """Announce a topic; returns the number that `write` takes, from 1 on."""
         self._topics.append(topic)
-        self._counts.append(0)
         with self._failing():
-            self._channels.append(announce(self._open, topic))
-        return len(self._topics) - 1
+            return announce(self._open, topic)
 
     def set_custom_data(self, values: Mapping[str, str]) -> None:
         """Add to the custom metadata, in the file at once."""
@@ -160,26 +151,26 @@ class BagWriter:
     ) -> None:
         """Write one message; arguments as in `Sample`, `publish_time_ns` None for the log time."""
         sent_ns = log_time_ns if publish_time_ns is None else publish_time_ns
-        self.write_all(iter([(topic, log_time_ns, data, sent_ns, sequence)]))
+        self.write_all(iter([(topic, log_time_ns, data, sent_ns, sequence)]), len(data))
 
-    def write_all(self, samples: Iterator[Sample]) -> None:
-        """Write messages. After `MessageTooLarge` the iterator stands behind the one that was refused."""
-        watched = self._splits or self._file_start_ns is None
-        add, channels, largest = self._add, self._channels, self.options.max_message_bytes
+    def write_all(self, samples: Iterator[Sample], largest: float = math.inf) -> None:
+        """Write messages of at most `largest` bytes each, as far as that is known.
+
+        After `MessageTooLarge` the iterator stands behind the message that was refused.
+        """
+        watched = self._splits or largest > self.options.max_message_bytes
         with self._failing():
-            for topic, log_time_ns, data, publish_time_ns, sequence in samples:
-                if watched or len(data) > largest:
-                    self._prepare(topic, log_time_ns, len(data))
-                    watched = self._splits
-                    add, channels = self._add, self._channels
-                add(channels[topic], log_time_ns, data, publish_time_ns, sequence & 0xFFFFFFFF)
+            for sample in samples if watched else islice(samples, int(self._file_start_ns is None)):
+                self._prepare(*sample[:2], len(sample[2]))
+                self._add(*sample)
+            deque(starmap(self._add, samples), 0)  # a topic's number is its channel's: nothing of ours stands between
 
     def _prepare(self, topic: int, log_time_ns: int, size: int) -> None:
         """Refuse a message that is too large; begin the next file, if the present one is full or old enough."""
         options, file = self.options, self._open
         if size > options.max_message_bytes:
             raise MessageTooLarge(
-                f"{self.path}: {self._topics[topic].name}: a message of {size} bytes was not written; "
+                f"{self.path}: {self._topics[topic - 1].name}: a message of {size} bytes was not written; "
                 f"allowed: <= {options.max_message_bytes}"
             )
         given = self._fill[1] if self._fill[0] == file.size_bytes else 0
@@ -234,8 +225,11 @@ class BagWriter:
             with self._failing():
                 self._check_disk(wait=True)
         finally:
-            topics = list(zip(self._topics, self._counts, strict=True))
-            write_metadata(self.path, metadata.bag_information("mcap", self._spans, topics, self.custom_data))
+            write_metadata(self.path, self._information(self._spans, self._counts))
+
+    def _information(self, files: Sequence[metadata.FileSpan], counts: Counter[int]) -> dict[str, Any]:
+        topics = [(topic, counts[number]) for number, topic in enumerate(self._topics, 1)]
+        return metadata.bag_information("mcap", files, topics, self.custom_data)
 
     def abandon(self) -> None:
         """Close without index and metadata, as a crash would leave the bag (see `recover`)."""
@@ -271,7 +265,8 @@ class BagWriter:
                 self._on_disk(partial(sync_folder, self.path))
                 if self.custom_data:
                     file.writer.add_metadata(metadata.CUSTOM_METADATA, self.custom_data)
-                self._channels = [announce(file, topic) for topic in self._topics]
+                if [announce(file, topic) for topic in self._topics] != [*range(1, len(self._topics) + 1)]:
+                    raise AssertionError("channels are numbered in the order they are announced")
             except OSError:
                 file.abandon(remove=True)
                 raise
@@ -283,19 +278,14 @@ class BagWriter:
             with self._failing():
                 if not file.broken:
                     file.writer.flush()
-                    counts = [
-                        (topic, file.counts[channel])
-                        for topic, channel in zip(self._topics, self._channels, strict=True)
-                    ]
-                    information = metadata.bag_information("mcap", [file.span], counts, self.custom_data)
+                    information = self._information([file.span], file.counts)
                     file.writer.add_metadata("rosbag2", {"serialized_metadata": metadata.yaml_text(information)})
                     file.finish(sync=False)
                     self._on_disk(partial(_sync_file, file.path))
         finally:
             file.abandon()
             self._file = self._file_start_ns = None
-            for index, channel in enumerate(self._channels):
-                self._counts[index] += file.counts[channel]
+            self._counts += file.counts
             self._spans.append(file.span)
             self._closed_bytes += file.size_bytes
 

@@ -21,7 +21,7 @@ from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.control.inputs import ValueLimits, Violation, check_value
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.thresholds import RECORDED, input_limits
-from iwm_power_manager.errors import BagError
+from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.mdp.demand import Source, signal_source
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.model.parameters import VehicleParams
@@ -97,6 +97,7 @@ class SignalStream:
     ----------
     signals : those the bag holds; pedals only where it holds no other demand
     taken, bad : messages by topic so far: of all, and those that could not be decoded or held no number of use
+    reasons : by topic, why its first message could not be decoded
     without : messages by topic and wheels they had no number for
     problems : topics that cannot be read, a line each
     """
@@ -106,6 +107,7 @@ class SignalStream:
     ) -> None:
         self.taken: Counter[str] = Counter()
         self.bad: Counter[str] = Counter()
+        self.reasons: dict[str, str] = {}
         self.without: Counter[str] = Counter()
         self.problems: list[str] = []
         self._by_stamp = True
@@ -132,10 +134,17 @@ class SignalStream:
         sources = mapping.sources.get("wheel_speed", ())
         own = [held.get(source.topic, source.topic) for source in sources if len(sources) > 1]
         self._topic_of = dict(zip(WHEEL_NAMES, own, strict=False))  # of each wheel that has one of its own
-        readers = (
-            readings.topic_readers(mapping, types, readings.Assembly(WHEEL_NAMES, vehicle), wanted) if wanted else {}
-        )
-        self._readers: dict[str, readings.TopicReader] = {held[topic]: reader for topic, reader in readers.items()}
+        assembly = readings.Assembly(WHEEL_NAMES, vehicle)
+        found = readings.topic_readers(mapping, types, assembly, wanted) if wanted else {}
+        self._readers: dict[str, readings.TopicReader] = {held[topic]: reader for topic, reader in found.items()}
+        for name, other in bag.topics.items():
+            for topic in found if name != other.name else ():  # another definition of a topic
+                try:
+                    if held[topic] == other.name:
+                        more = readings.topic_readers(mapping, {topic: _types(bag, name)}, assembly, wanted)
+                        self._readers[name] = more[topic]
+                except (BagError, ConfigError) as error:
+                    self.problems.append(str(error))
 
     @property
     def bad_messages(self) -> int:
@@ -178,8 +187,9 @@ class SignalStream:
         self.taken[topic] += 1
         try:
             found = reader.read(data, log_time_ns)
-        except UnreadableError:
+        except UnreadableError as error:
             self.bad[topic] += 1
+            self.reasons.setdefault(topic, str(error))
             return []
         for reading in found:
             if not _usable(reading):
@@ -211,6 +221,8 @@ def _advance(times: Sequence[tuple[int, int]]) -> bool:
 def _types(bag: BagReader, name: str) -> Types:
     """The types of a recorded topic by the definition in its bag."""
     topic = bag.topics[name]
+    if not topic.type:
+        raise BagError(f"{name}: the bag does not say of which type its messages are")
     if topic.serialization.lower() not in ("cdr", ""):
         raise BagError(f"{name}: its messages are {topic.serialization!r}, not CDR")
     sample = b""

@@ -63,6 +63,7 @@ class Replay:
         self._bag = bag
         self._radius_m = plan.vehicle.params.front.wheel.radius_m
         self._shown_mps = self._rolled_mps = 0.0  # sums of the speed, and of the wheels' rims
+        self._along = 0.0  # of their product: below 0 where they have opposite signs
         state = state_topic(bag)
         exact = state is not None and first_message(bag, state) is not None
         report = self._report = ReplayReport([*plan.notes], exact)
@@ -124,6 +125,8 @@ class Replay:
         """A line, if speed and wheel speeds cannot both be in the unit they were read in."""
         if max(self._shown_mps, self._rolled_mps) < _MOVING_MPS:
             return []
+        if self._along < 0.0:
+            return ["speed and wheel_speed are of opposite signs in most steps: is the sign of one of them wrong?"]
         return list(filter(None, [apart(self._shown_mps, self._rolled_mps, self._radius_m)]))
 
     def _find_commands(self, mapping: SignalMapping, tolerance: float) -> None:
@@ -150,8 +153,10 @@ class Replay:
 
     def _compare(self, step: ReplayedStep) -> None:
         values = step.values
+        rolled_mps = (values[1] + values[2] + values[3] + values[4]) * 0.25 * self._radius_m
         self._shown_mps += abs(values[0])
-        self._rolled_mps += abs(values[1] + values[2] + values[3] + values[4]) * 0.25 * self._radius_m
+        self._rolled_mps += abs(rolled_mps)
+        self._along += values[0] * rolled_mps
         for command in self._commands.values():
             command.recomputed(step)
         self._state_comparer.recomputed(step.stamp_ns, step.log_time_ns, DECIDED_NAMES, tuple(values[DECIDED]))

@@ -22,7 +22,7 @@ from iwm_power_manager.control.stepping import AsRecorded, Lockstep, Taken
 from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.thresholds import RECORDED, actuator_limits, input_limits, supervision_limits
 from iwm_power_manager.control.types import Command, initial_state
-from iwm_power_manager.errors import BagError
+from iwm_power_manager.errors import BagError, one_line
 from iwm_power_manager.replay.compare import ReplayReport, TopicComparer
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import Recorded, SignalStream, check_signals
@@ -52,6 +52,8 @@ FloatArray = NDArray[np.float64]
 
 #: A pause in the recording longer than this starts the law anew.
 _PAUSE_S = 1.0
+#: An input that is older at a step made of inputs is said to be.
+_OLD_NS = 500_000_000
 #: Values from the start of a bag that show whether its messages come in sets of one stamp.
 _PROBE_VALUES = 400
 #: Below this share of the messages of the busiest topic, or of the wheel speeds, a replay says that it made few steps.
@@ -271,6 +273,8 @@ class ReconstructedSteps:
         self._in_sets = not standing and _in_sets([value for _, value in probe[:_PROBE_VALUES]])
         self._wheels = self._again = 0  # wheel speeds, and those of them with the stamp of the one before
         self._wheels_ns = -1
+        self._came_ns: dict[str, int] = {}  # of each kind of input, by the log
+        self._old: Counter[str] = Counter()  # wheel speeds that came when another input had not come for long
         vehicle = plan.vehicle.params
         judged = input_limits(RECORDED, vehicle.front.wheel.radius_m, by_clock=False)
         limits = ControllerLimits(judged, None, supervision_limits(RECORDED), actuator_limits(RECORDED))
@@ -296,15 +300,16 @@ class ReconstructedSteps:
             if tally.dropped
         }
         for (wheel, verdict), count in inputs.wheels_refused.items():
-            if verdict is not WheelVerdict.ABSENT:  # that is said of the messages
+            if verdict is not WheelVerdict.ABSENT or not self._stream.without:  # that is said of the messages
                 found.setdefault(f"wheel {wheel}", {})[verdict.name.lower()] = count
         return found
 
     def why_none(self) -> str:
         """Why there is no step, topic by topic."""
-        taken, bad = self._stream.taken, self._stream.bad
+        taken, bad, why = self._stream.taken, self._stream.bad, self._stream.reasons
         parts = [
-            f"{topic}: {taken[topic]} messages" + (f", {bad[topic]} of them bad" if bad[topic] else "")
+            f"{topic}: {taken[topic]} messages"
+            + (f", {bad[topic]} of them bad ({one_line(why.get(topic, 'no number'), 100)})" if bad[topic] else "")
             for topic in sorted(self._stream.topics)
         ]
         for name, reasons in self.not_believed().items():
@@ -321,6 +326,11 @@ class ReconstructedSteps:
             f"{which} has no number in {count} messages: lost, as in the node"
             for which, count in stream.without.items()
         ]
+        found += [
+            f"{topic} had not come for {1e-9 * _OLD_NS:g} s at {count} wheel speeds: taken as it was last"
+            for topic, count in self._old.items()
+            if count > 1  # one is the first after a pause of all
+        ]
         most = max(stream.taken[topic] for topic in stream.topics)
         if 0 < steps <= _FEW_STEPS * most:
             found.append(f"only {steps} steps of {most} messages: {self.why_none()}")
@@ -334,12 +344,15 @@ class ReconstructedSteps:
             reading: Any = value.reading
             topic = _TOPICS.get(type(reading))
             if topic == monitor.WHEELS:
+                self._old.update(kind for kind, at in self._came_ns.items() if value.log_time_ns - at > _OLD_NS)
                 self._wheels += 1
                 self._again += reading.stamp_ns == self._wheels_ns
                 self._wheels_ns = reading.stamp_ns
             if topic == monitor.FRICTION:
                 self._friction(reading.friction, reading.stamp_ns)
             elif topic is not None:
+                if topic in (monitor.SPEED, monitor.DEMAND):
+                    self._came_ns[topic] = value.log_time_ns
                 content = reading.power_w if topic == monitor.DEMAND else reading
                 take = self._push if self._in_sets else self._use
                 for taken in take(topic, content, reading.stamp_ns, value.publish_time_ns):

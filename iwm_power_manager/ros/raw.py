@@ -34,6 +34,9 @@ Taken = tuple[int, int, bytes, int, int]
 CLOCK_FIELDS = struct.Struct("<iI")
 CLOCK_FIELDS_OFFSET = 4
 
+#: The counter as a bag has it: 32 bits.
+_COUNTER = 0xFFFFFFFF
+
 #: Messages taken from one topic before the next has its turn, so that a flood on one cannot starve the others.
 _TURN = 5000
 
@@ -117,7 +120,7 @@ class RawSubscriptions:
             try:
                 topic = self._topics.get(name)
                 if topic is None:
-                    topic = _Topic(len(self._topics), name, _message_class(name, types))
+                    topic = _Topic(len(self._topics) + 1, name, _message_class(name, types))
                     self._prepare(types[0])
                     self._subscribe(topic, publishers)
                     self._topics[name] = topic
@@ -174,7 +177,7 @@ class RawSubscriptions:
                         topic.missed += sequence - 1
                 last = sequence
                 received = info["received_timestamp"] or time.time_ns()
-                batch.append((number, received, data, info["source_timestamp"] or received, sequence))
+                batch.append((number, received, data, info["source_timestamp"] or received, sequence & _COUNTER))
         topic.count += len(batch) - before
         topic.last = last
         if topic.single:

@@ -74,7 +74,7 @@ def types_of(msgtype: str, encoding: str = "", text: str = "", sample: bytes = b
 
     Parameters
     ----------
-    msgtype : name, `pkg/msg/Type` or `pkg/Type`
+    msgtype : name, `pkg/msg/Type` or `pkg/Type`, or as IDL has it: `pkg::msg::Type`
     encoding : of `text`: "ros2msg", "ros2idl"; a text in any other is not read
     text : definition with all it depends on; "" for the installed one
     sample : a message of this type: decides how wide characters are stored, in a type that has any
@@ -110,9 +110,10 @@ def _types_of(msgtype: str, encoding: str, text: str, wide: str) -> Types:
     from rosbags.typesys.store import Typestore
 
     try:
-        name = full_name(msgtype)
         encoding = IDL if encoding == "omgidl" else encoding
+        name = msgtype.replace("::", "/") if encoding == IDL and text else full_name(msgtype)
         known: dict[str, Any] = _parsed(name, encoding, text) if text and encoding in (MSG, IDL) else {}
+        name = name if name in known else full_name(msgtype)
         given = _needed(name, known, wide)
         _measure(name, given)
         store = Typestore()
@@ -139,7 +140,7 @@ def standard_types() -> Typestore:
 
 def full_name(msgtype: str) -> str:
     """`package/msg/Type` of `package/Type`; raises `BagError` for what is no name of a message type."""
-    package, _, rest = msgtype.partition("/")
+    package, _, rest = msgtype.replace("::", "/").partition("/")
     kind, _, name = rest.rpartition("/")
     full = f"{package}/{kind or 'msg'}/{name}"
     if not re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*){2,3}", full, re.ASCII):
@@ -152,7 +153,8 @@ def _parsed(name: str, encoding: str, text: str) -> dict[str, Any]:
 
     if len(text) > MAX_TEXT_BYTES:
         raise BagError(f"its definition has {len(text)} characters; allowed: <= {MAX_TEXT_BYTES}")
-    lines = (line.strip() for line in re.split("[\r\n\f\v\0]+", text.lstrip("\ufeff").replace("\t", " ")))
+    text = re.sub("[\t\u00a0]", " ", text.lstrip("\ufeff"))
+    lines = (line.strip() for line in re.split("[\r\n\f\v\0]+", text))
     # The grammar of IDL knows no directives, with which each text of rosidl begins.
     text = "\n".join(line for line in lines if line and not (encoding == IDL and line.startswith("#")))
     text = re.sub("^={40,}$", _SEPARATOR, text, flags=re.MULTILINE)
@@ -259,4 +261,5 @@ def _place(error: Exception) -> str:
     if isinstance(error, RecursionError):
         return ": is nested too deep"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return f", at {lines[-1][:80]!r}" if lines else ""
+    where = [line for line in lines if not line.startswith("{\"'")]  # what a parser would have liked better
+    return f", at {where[-1][:80]!r}" if where else ""

@@ -70,6 +70,20 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_or_may_is_damage(
     assert any("the chunk at byte" in line for line in damage)
 
 
+def test_of_many_chunks_that_are_large_by_themselves_only_as_many_are_unpacked_as_the_file_may_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(limits, "MAX_CHUNK_BYTES", 2**20)
+    empty = foreign.message_records([(1, 1, b"")]) * 20_000
+    packed = foreign.chunk(empty, "zstd", zstandard.compress(empty))
+    path = foreign.write_records(tmp_path / "a.mcap", foreign.announced(), *[packed] * 200)
+    count, damage = contents(path)
+    assert 31 * count < 2**20 + limits.MAX_RATIO * path.stat().st_size < 31 * (count + 20_000)
+    assert damage[0].endswith("is left out: those before it hold 1000 times what the file has")
+    assert damage[-1].endswith("is damaged at more places")
+    assert len(damage) == limits.MAX_NOTES + 1
+
+
 def test_a_frame_that_says_gigabytes_allocates_none(tmp_path: Path) -> None:
     frame = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 2**40) + bytes(8)
     with pytest.raises(BagError):
@@ -165,6 +179,33 @@ def test_a_compressed_file_that_holds_nothing_says_why(tmp_path: Path) -> None:
     path.write_bytes(foreign.write_mcap(tmp_path / "a.mcap", foreign.drive(5)).read_bytes())
     with pytest.raises(BagError, match=r"a_0\.mcap\.zstd: is damaged: zstd decompress error: Unknown frame"):
         contents(path)
+
+
+def test_of_a_compressed_file_what_stands_before_damage_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a_0.mcap.zstd"
+    whole = foreign.write_mcap(tmp_path / "a.mcap", foreign.drive(5)).read_bytes()
+    path.write_bytes(zstandard.compress(whole) + b"garbage")
+    count, (line,) = contents(path)
+    assert count == 15
+    assert "is damaged: zstd decompress error: Unknown frame" in line
+    assert recover(path).files[0].message_count == 15
+
+
+def test_a_compressed_file_whose_name_does_not_say_so_is_read_and_recovered(tmp_path: Path) -> None:
+    whole = foreign.write_mcap(tmp_path / "a.mcap", foreign.drive(5)).read_bytes()
+    path = tmp_path / "a_0.mcap"
+    path.write_bytes(zstandard.compress(whole))
+    count, (line,) = contents(path)
+    assert (count, line) == (15, f"{path}: is compressed, which its name does not say")
+    assert recover(path).files[0].message_count == 15
+    assert contents(path) == (15, [])
+
+
+@pytest.mark.parametrize("listed", ["bag\\a_0.mcap", "C:\\bags\\bag\\a_0.mcap", "bag/a_0.mcap", ".."])
+def test_paths_of_other_systems_and_older_versions_lead_to_the_file(tmp_path: Path, listed: str) -> None:
+    folder = foreign.write_bag(tmp_path / "bag", foreign.drive(5))
+    foreign.write_metadata(folder, relative_file_paths=[listed])
+    assert contents(folder) == (15, [])
 
 
 def test_a_data_file_is_what_its_first_bytes_say(tmp_path: Path) -> None:

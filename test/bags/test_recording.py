@@ -29,7 +29,7 @@ from iwm_power_manager.errors import BagError
 SAMPLE_BYTES = SAMPLE_OVERHEAD_BYTES + len(float64(0.0))
 
 
-def samples(first: int, count: int, number: int = 0) -> list[Sample]:
+def samples(first: int, count: int, number: int = 1) -> list[Sample]:
     return [(number, i * 1_000_000, float64(i), i, i + 1) for i in range(first, first + count)]
 
 
@@ -56,7 +56,7 @@ def hold_the_writer(recording: Recording) -> threading.Event:
 def test_all_that_is_put_is_written_in_order(tmp_path: Path) -> None:
     recording = Recording(tmp_path / "bag")
     recording.start()
-    assert recording.add_topic(topic("/a")) == 0
+    assert recording.add_topic(topic("/a")) == 1
     for i in range(100):
         recording.put(samples(i * 10, 10))
     recording.put([])
@@ -168,8 +168,8 @@ def test_too_large_messages_are_counted_and_all_others_written(tmp_path: Path) -
     recording.start()
     recording.add_topic(topic("/a"))
     batch = samples(0, 10)
-    batch[3] = (0, 0, bytes(51), 0, 0)
-    batch[9] = (0, 0, bytes(1000), 0, 0)
+    batch[3] = (1, 0, bytes(51), 0, 0)
+    batch[9] = (1, 0, bytes(1000), 0, 0)
     recording.put(batch)
     recording.close()
     status = recording.status()
@@ -229,7 +229,7 @@ recording.start()
 recording.add_topic(topic("/a"))
 put = 0
 while not recording.failed.wait(0.0005):
-    recording.put([(0, i, float64(i), i, i + 1) for i in range(put, put + 100)])
+    recording.put([(1, i, float64(i), i, i + 1) for i in range(put, put + 100)])
     put += 100
 status = recording.call(recording.status)  # behind all that was put
 read = values(disk / "bag")
@@ -242,7 +242,7 @@ except Exception as error:
     refused = str(error)
 shutil.rmtree(disk / "bag")
 again = recording.start()
-recording.put([(0, i, float64(i), i, i + 1) for i in range(5)])
+recording.put([(1, i, float64(i), i, i + 1) for i in range(5)])
 recording.close()
 status = dataclasses.asdict(status)
 print(json.dumps({"put": put, "status": status, "read": read, "refused": refused, "again": values(again)}))

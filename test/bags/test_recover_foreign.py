@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import pytest
 import yaml
 import zstandard
 from mcap.reader import make_reader
-from mcap.records import Chunk
+from mcap.records import Attachment, Channel, Chunk
 from mcap.writer import Writer
 from rosbags.rosbag2 import Reader as RosbagsReader
 
@@ -240,6 +242,77 @@ def test_a_record_nobody_knows_is_carried_over_as_it_is(tmp_path: Path) -> None:
     recover(path)
     assert private in path.read_bytes()
     assert len(messages(path)) == 30
+
+
+@pytest.mark.parametrize("packer", [zstandard.compress, lz4.frame.compress], ids=["zstd", "lz4"])
+def test_a_chunk_of_several_frames_is_read_to_its_end(tmp_path: Path, packer: Callable[[bytes], bytes]) -> None:
+    records = foreign.message_records(foreign.drive(30))
+    packed = packer(records[:1000]) + packer(records[1000:1001]) + packer(records[1001:])
+    compression = "zstd" if packer is zstandard.compress else "lz4"
+    path = foreign.write_records(tmp_path / "a.mcap", foreign.announced(), foreign.chunk(records, compression, packed))
+    assert len(messages(path)) == 90
+    assert recover(path).files[0].damage == ""
+
+
+def test_a_message_of_several_frames_is_read_to_its_end(tmp_path: Path) -> None:
+    plain = foreign.drive(10)
+    packed = [(t, n, zstandard.compress(data[:9]) + zstandard.compress(data[9:])) for t, n, data in plain]
+    path = foreign.write_mcap(tmp_path / "a.mcap", packed)
+    assert [message.data for message in messages(path)] == [data for _, _, data in plain]
+
+
+@pytest.mark.parametrize("what", ["chunk", "attachment", "torn record"])
+def test_what_stands_in_a_chunk_and_cannot_be_read_is_said_and_the_original_kept(tmp_path: Path, what: str) -> None:
+    found = foreign.drive(20)
+    inner = {
+        "chunk": foreign.chunk(foreign.message_records(found[30:])),
+        "attachment": foreign.record(Attachment(1, 2, "a", "text/plain", b"x")),
+        "torn record": b"\5" + bytes([255]) * 8,
+    }[what]
+    whole = foreign.announced() + foreign.message_records(found[:30])
+    path = foreign.write_records(tmp_path / "bag" / "a_0.mcap", foreign.chunk(whole + inner))
+    with BagReader(path) as reader:
+        assert len(list(reader.messages())) == 30
+        assert [line.partition(": ")[2][:8] for line in reader.damage] == ["left out"]
+    original = path.read_bytes()
+    report = recover(path.parent).files[0]
+    assert (report.message_count, report.kept) == (30, "a_0.mcap.damaged")
+    assert (path.parent / report.kept).read_bytes() == original
+
+
+def test_a_channel_that_is_announced_anew_as_another_is_said_and_becomes_another(tmp_path: Path) -> None:
+    found = foreign.drive(20)
+    anew = foreign.record(Channel(2, "/other", "cdr", {}, 2))
+    path = foreign.write_records(
+        tmp_path / "a.mcap",
+        foreign.chunk(foreign.announced() + foreign.message_records(found[:30])),
+        foreign.chunk(anew + foreign.message_records(found[30:])),
+    )
+    with BagReader(path) as reader:
+        assert reader.damage == [f"{path}: announces channel 2 in more than one way: the first counts"]
+    assert recover(path).files[0].message_count == 60
+    with BagReader(path) as reader:
+        assert reader.damage == []
+        assert (reader.counts["/demand"], reader.counts["/other"]) == (10, 10)
+
+
+def test_a_file_whose_first_block_was_never_written_is_recovered_from_its_first_chunk_on(tmp_path: Path) -> None:
+    found = foreign.drive(20)
+    chunks = [foreign.announced() + foreign.message_records(found[i : i + 15]) for i in range(0, 60, 15)]
+    path = foreign.write_records(tmp_path / "a.mcap", *map(foreign.chunk, chunks))
+    path.write_bytes(bytes(512) + path.read_bytes()[512:])
+    report = recover(path).files[0]
+    assert (report.message_count, report.kept) == (45, "a.mcap.damaged")
+    assert "does not begin as an MCAP file" in report.damage
+    assert [message.data for message in messages(path)] == [data for _, _, data in found[15:]]
+
+
+def test_of_a_file_with_too_many_channels_the_messages_are_recovered(tmp_path: Path) -> None:
+    many = b"".join(foreign.record(Channel(i, f"/t{i}", "cdr", {}, 2)) for i in range(10, 65_536))
+    records = foreign.message_records(foreign.drive(5))
+    path = foreign.write_records(tmp_path / "a.mcap", foreign.announced(), foreign.chunk(many), foreign.chunk(records))
+    assert recover(path).files[0].message_count == 15
+    assert {message.topic for message in messages(path)} == {"/car/speed", "/demand", "/joint_states"}
 
 
 def test_behind_a_stretch_that_a_power_cut_has_left_empty_reading_goes_on(tmp_path: Path) -> None:

@@ -55,6 +55,13 @@ def with_speed(**changes: str) -> list[foreign.Channel]:
         with_speed(text=foreign.IDL_TEXT, encoding="ros2idl"),
         with_speed(text=foreign.ROSIDL_TEXT, encoding="ros2idl"),
         with_speed(text=foreign.ROSIDL_TEXT.replace("\n", "\r\n"), encoding="ros2idl"),
+        with_speed(text=foreign.IDL_TEXT, encoding="omgidl", type="my_msgs::msg::Speed"),
+        with_speed(
+            text=foreign.IDL_TEXT.replace("my_msgs { module msg", "my_msgs { module dds_"),
+            encoding="omgidl",
+            type="my_msgs::dds_::Speed",
+        ),
+        with_speed(text=SPEED.text.replace("float64 value", "float64\u00a0value"), type="my_msgs::msg::Speed"),
     ],
     ids=[
         "as written",
@@ -66,6 +73,9 @@ def with_speed(**changes: str) -> list[foreign.Channel]:
         "IDL",
         "rosidl's",
         "rosidl's, CRLF",
+        "name as in IDL",
+        "module of its own",
+        "hard blank",
     ],
 )
 def test_a_type_of_another_package_is_read_by_the_definition_in_the_bag(
@@ -74,6 +84,41 @@ def test_a_type_of_another_package_is_read_by_the_definition_in_the_bag(
     report, speeds = replayed(write_bag(tmp_path / "bag", drive(), channels), mapping)
     assert (report.steps, report.bad_messages, report.damage) == (COUNT, 0, [])
     assert max(speeds) == pytest.approx(9.5, abs=0.01)
+
+
+def test_a_topic_of_two_definitions_in_one_bag_is_read_by_each(tmp_path: Path, mapping: Path) -> None:
+    head, rest = SPEED.text.split("float64 value\n")
+    texts = [f"{head}float64 value\nfloat64 age\n{rest}", f"{head}float64 age\nfloat64 value\n{rest}"]
+    age = struct.pack("<d", 0.5)
+    halves = [
+        [(t, n, data + age if n == 0 else data) for t, n, data in drive()[:150]],
+        [(t, n, data[:-8] + age + data[-8:] if n == 0 else data) for t, n, data in drive()[150:]],
+    ]
+    folder = tmp_path / "bag"
+    for i, (text, half) in enumerate(zip(texts, halves, strict=True)):
+        write_mcap(folder / f"a_{i}.mcap", half, with_speed(text=text))
+    foreign.write_metadata(folder, relative_file_paths=["a_0.mcap", "a_1.mcap"])
+    report, speeds = replayed(folder, mapping)
+    assert (report.steps, report.bad_messages) == (COUNT, 0)
+    assert min(speeds) >= 8.0
+    assert [line.partition(": ")[2] for line in report.damage] == [
+        "/car/speed has more than one definition: each message is read by its own"
+    ]
+
+
+def test_an_input_that_stays_away_is_said(tmp_path: Path, mapping: Path) -> None:
+    entries = [entry for i, entry in enumerate(drive()) if entry[1] != 0 or i < 150]
+    report, _ = replayed(write_bag(tmp_path / "bag", entries), mapping)
+    assert report.steps == COUNT
+    assert "vehicle_speed had not come for 0.5 s at 26 wheel speeds: taken as it was last" in report.notes
+
+
+def test_a_speed_against_the_wheels_is_said(tmp_path: Path, mapping: Path) -> None:
+    entries = [(t, n, data[:-8] + struct.pack("<d", -8.0) if n == 0 else data) for t, n, data in drive()]
+    report, _ = replayed(write_bag(tmp_path / "bag", entries), mapping)
+    assert (
+        "speed and wheel_speed are of opposite signs in most steps: is the sign of one of them wrong?" in report.notes
+    )
 
 
 def test_a_fork_of_a_standard_type_is_read_as_the_bag_has_it(tmp_path: Path, mapping: Path) -> None:
@@ -265,7 +310,7 @@ def test_a_bag_that_gives_no_step_says_why_topic_by_topic(
         assert main([str(bag), "--mapping", str(mapping), "--strategy", "equal", *more]) == BAD_INPUT
         (line,) = capsys.readouterr().err.splitlines()
         assert "gave no control step: " in line
-        assert f"/joint_states: {COUNT} messages, {COUNT} of them bad" in line
+        assert f"/joint_states: {COUNT} messages, {COUNT} of them bad (is no sensor_msgs/msg/JointState: " in line
         assert f"/demand: {COUNT} messages" in line
 
 
