@@ -75,6 +75,21 @@ def share_changes(share: FloatArray, least: float = SHARE_CHANGE) -> int:
     return count
 
 
+def share_swings(share: FloatArray, width: float = SHARE_CHANGE) -> int:
+    """Number of times the share leaves a band of this width: the fewest cuts that leave no wider swing between them.
+
+    `share_changes` is blind to a share that swings around where it last counted, by up to twice what counts.
+    """
+    count = 0
+    low = high = share[0] if share.size else 0.0
+    for value in share[np.flatnonzero(np.diff(share, prepend=np.nan))]:
+        low, high = min(low, value), max(high, value)
+        if high - low > width + ROUNDING:
+            count += 1
+            low = high = value
+    return count
+
+
 def longest_s(mask: npt.NDArray[np.bool_], dt_s: float) -> float:
     """Length of the longest stretch of True, s."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))

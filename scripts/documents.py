@@ -30,7 +30,7 @@ from iwm_power_manager.share import share_path
 from iwm_sim.study import labels, paper, unseen
 from iwm_sim.study.answers import answers, savings
 from iwm_sim.study.content import Study, rounded
-from iwm_sim.study.frontier import COUNTS, Frontier, margin
+from iwm_sim.study.frontier import COUNTS, SWINGS, Frontier, margin
 from iwm_sim.study.plan import IDLE_DRIVES
 from iwm_sim.study.report import Column, format_value
 from iwm_sim.study.rows import Place, Row, by_place
@@ -210,6 +210,7 @@ def unseen_summary(frontiers: Sequence[Frontier]) -> dict[str, Any]:
         "part_above_10": sum(point.changes_per_min > 10.0 for _, point, _ in judged) / len(judged),
         "most_changes_per_min": max(point.changes_per_min for _, point, _ in judged),
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in unseen.judge(frontiers)],
+        "swings": [verdict._asdict() for verdict in unseen.judge(frontiers, (SWINGS,))],
         "kinds": [kind._asdict() for kind in unseen.kinds(frontiers)],
         "with_rivals": _margins([cell[2] for cell in judged if _has_rival(cell[0])]),
         "close_by_kind": {
@@ -270,6 +271,11 @@ def unseen_kinds(found: dict[str, Any]) -> str:
 def unseen_verdicts(found: dict[str, Any]) -> str:
     """The judgement, with what to know before its mean is read."""
     rivals, own = found["with_rivals"], found["papers_car"]
+    swings = "".join(
+        f" Counting swings out of a band of 0.25, the worst margin is {row['worst']:+.3f}, and "
+        f"{100.0 * row['part_close']:.1f} % are at most {unseen.CLOSE:g} behind."
+        for row in found.get("swings", ())  # a file of before they were counted has none
+    )
     columns: list[Column[dict[str, Any]]] = [
         Column("changes counted", lambda row: _COUNTED[row["counted"]]),
         Column("cells", lambda row: row["cells"], decimals=0),
@@ -288,7 +294,7 @@ def unseen_verdicts(found: dict[str, Any]) -> str:
         f"saving. In the other {rivals['cells']} cells: mean {rivals['mean']:+.3f}, median {rivals['median']:+.3f}, "
         f"worst {rivals['worst']:+.3f}, {100 * rivals['close'][0]:.1f} % at most {unseen.CLOSE:g} behind. The paper's "
         f"car alone: {own['cells']} cells, mean {own['mean']:+.3f}, median {own['median']:+.3f}, "
-        f"{100 * own['close'][0]:.1f} %."
+        f"{100 * own['close'][0]:.1f} %.{swings}"
     )
 
 

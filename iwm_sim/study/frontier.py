@@ -29,7 +29,7 @@ from iwm_power_manager.tools.command import made_with
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim import closed_loop, preview
 from iwm_sim.closed_loop import Noise, Run
-from iwm_sim.metrics import Metrics, measure, share_changes
+from iwm_sim.metrics import Metrics, measure, share_changes, share_swings
 from iwm_sim.study import generate
 from iwm_sim.study.report import Column
 from iwm_sim.study.rows import saving_percent
@@ -46,6 +46,8 @@ RIVAL = "instantaneous_slip"
 #: Ways of counting changes, by the field of `Point`.
 COUNTS = ("changes_per_min", "fine_changes_per_min", "travel_per_min")
 FINE_CHANGE = 0.05
+#: A fourth way, for what the first one is blind to; no part of any target.
+SWINGS = "swings_per_min"
 
 _DT_S = 0.01
 
@@ -100,6 +102,7 @@ class Point(NamedTuple):
     busiest_minute : most changes in any minute
     held : whether this run and that of equal split held the trace
     policy : grid and checksum of the policy it was driven with, of ours
+    swings_per_min : out of a band of a quarter (`share_swings`); None in a file of before they were counted
     """
 
     strategy: str
@@ -111,6 +114,7 @@ class Point(NamedTuple):
     busiest_minute: int
     held: bool
     policy: str = ""
+    swings_per_min: float | None = None
 
 
 class Frontier(NamedTuple):
@@ -179,6 +183,7 @@ def _point(strategy: str, setting: float, run: Run, place: Place, reference: _Re
         travel_per_min=metrics.share_travel_per_min,
         busiest_minute=busiest_minute(share, run.dt_s),
         held=metrics.trace_held and reference.metrics.trace_held,
+        swings_per_min=share_swings(share) / minutes,
     )
 
 
@@ -217,8 +222,8 @@ def measure_frontier(
 
 
 def margin(point: Point, rivals: Sequence[Point], count: str) -> float | None:
-    """Saving of a point minus the best of its rivals with no more changes, in points; None where there is no saving."""
-    if point.saving_percent is None or not point.held:
+    """Saving of a point minus the best of its rivals with no more changes, in points; None where there is none."""
+    if point.saving_percent is None or not point.held or getattr(point, count) is None:
         return None
     within = getattr(point, count) + 1e-9
     best = max(

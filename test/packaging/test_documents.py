@@ -152,3 +152,6 @@ def test_of_cells_that_nobody_chose_the_worst_and_those_without_a_rival_are_coun
     assert found["with_rivals"]["mean"] == pytest.approx(0.25)
     assert found["close_by_kind"]["paper's car, friction 0.9"]["close"] == [0.5, 0.5, 0.5]
     assert "| paper's car, friction 0.9 | 2 | 50.0 |" in documents.unseen_worst(found)
+    swings = {"worst": -0.25, "part_close": 0.5}
+    assert found["swings"] == [] and "swings" not in documents.unseen_verdicts(found)
+    assert "the worst margin is -0.250, and 50.0 %" in documents.unseen_verdicts(found | {"swings": [swings]})

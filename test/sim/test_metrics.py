@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.closed_loop import COLUMNS, Run
-from iwm_sim.metrics import longest_s, measure, share_changes, trace_excess_mps
+from iwm_sim.metrics import longest_s, measure, share_changes, share_swings, trace_excess_mps
 from iwm_sim.plant import initial_plant
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
@@ -54,10 +56,30 @@ def test_a_car_a_second_late_or_two_miles_an_hour_off_holds_the_trace():
         ([0.5, 0.6, 0.7, 0.8, 0.9, 1.0], 1),  # counted at 0.8, from there to 1.0 is too little
         ([0.0, 0.2, 0.0, 0.2, 0.0], 0),
         ([1.0, 0.0, 1.0, 0.0], 3),
+        ([0.25, 0.0, 0.5, 0.0, 0.5], 0),  # around where it last counted
     ],
 )
 def test_a_share_change_is_a_move_by_more_than_a_quarter_from_where_it_last_counted(share, count):
     assert share_changes(np.array(share)) == count
+
+
+@given(st.lists(st.integers(0, 20), min_size=1, max_size=12), st.integers(0, 12))
+def test_swings_are_the_fewest_places_that_leave_no_swing_wider_than_a_quarter(steps, least):
+    """Against all ways to cut the shares into pieces, the fewest first."""
+    cuts = range(1, len(steps))
+
+    def calm(chosen):
+        edges = [0, *chosen, len(steps)]
+        return all(max(steps[a:b]) - min(steps[a:b]) <= least for a, b in itertools.pairwise(edges))
+
+    fewest = next(n for n in range(len(steps)) if any(map(calm, itertools.combinations(cuts, n))))
+    share, width = np.array(steps) / 20.0, least / 20.0
+    assert share_swings(share, width) == fewest >= share_changes(share, width)
+
+
+def test_a_share_that_swings_around_where_it_last_counted_is_seen_by_its_swings_alone():
+    share = np.array([0.25, 0.0, 0.5, 0.0, 0.5])
+    assert (share_changes(share), share_swings(share), share_swings(np.array([]))) == (0, 3, 0)
 
 
 @given(st.lists(st.booleans(), max_size=30))

@@ -33,6 +33,18 @@ def test_a_margin_is_against_the_best_rival_with_no_more_changes():
     assert frontier.margin(point(None, 6.0), rivals, "changes_per_min") is None
 
 
+def test_margins_by_swings_stand_beside_the_judgement_and_are_no_part_of_it():
+    rivals = (point(0.5, 1.0)._replace(swings_per_min=120.0), point(0.2, 5.0)._replace(swings_per_min=5.0))
+    blind = Frontier("blind", MADE, rivals, (point(0.3, 5.0)._replace(swings_per_min=5.0),), ())
+    (swings,) = unseen.judge([blind], (frontier.SWINGS,))
+    assert swings.worst == pytest.approx(0.1)
+    assert [verdict.worst for verdict in unseen.judge([blind])] == pytest.approx([-0.2, -0.2, -0.2])
+    assert "swings_per_min, no part of the target: worst +0.100 points" in unseen.report([blind])
+    assert unseen.to_json([blind])["swings"] == [swings._asdict()]
+    before = blind._replace(ours=(point(0.3, 5.0),))  # of a file without them
+    assert unseen.judge([before], (frontier.SWINGS,)) == []
+
+
 def test_the_busiest_minute_counts_changes_by_more_than_a_quarter():
     share = np.full(20_000, 0.5)
     share[3000:] = 1.0
