@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from bags_helpers import write_drive
 from iwm_power_manager.control.settings import default_settings
@@ -154,9 +155,11 @@ def cost_of(policy_file: Path, friction: float, idle_drive: str) -> tuple[float,
     return found.wh_per_km, found.wh_per_km + moves_j / 3600.0 / (found.distance_m / 1000.0)
 
 
-def learned_and_general(bag: Path, folder: Path, friction: float, idle_drive: str, tried: list[str]) -> list[Path]:
+def learned_and_general(
+    bag: Path, folder: Path, friction: float, idle_drive: str, tried: list[str], grid: str = "coupled"
+) -> list[Path]:
     """Policy files: from the bag, and from the three standard cycles."""
-    common = ["--vehicle", CAR, "--idle-drive", idle_drive, "--friction", str(friction), "--quiet"]
+    common = ["--vehicle", CAR, "--idle-drive", idle_drive, "--friction", str(friction), "--grid", grid, "--quiet"]
     learned, general = folder / "learned.npz", folder / "general.npz"
     numbers = ["--json", str(folder / "learn.json")]
     trial = ["--bag", str(bag), "--drive", "nycc", *tried, "--jobs", "2", "--output", str(learned)]
@@ -168,7 +171,13 @@ def learned_and_general(bag: Path, folder: Path, friction: float, idle_drive: st
 
 def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(tmp_path: Path) -> None:
     tried = ["--weights", "1", "inf", "--bandwidths", "1"]
-    learned, general = learned_and_general(drive_nycc(tmp_path, 0.2, "none"), tmp_path, 0.2, "none", tried)
+    settings = yaml.safe_load(share_path("config/grids/coupled.yaml").read_text())
+    settings["power_w"]["of_car"] = settings["power_w"]["of_car"][1::2]
+    settings["share"]["step"] = 0.1
+    grid = tmp_path / "coarse.yaml"
+    grid.write_text(yaml.safe_dump(settings))
+    bag = drive_nycc(tmp_path, 0.2, "none")
+    learned, general = learned_and_general(bag, tmp_path, 0.2, "none", tried, str(grid))
     energy, cost = cost_of(learned, 0.2, "none")
     general_energy, general_cost = cost_of(general, 0.2, "none")
     assert energy <= general_energy and cost <= general_cost
