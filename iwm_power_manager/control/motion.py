@@ -574,8 +574,8 @@ def _used_wheels(
     front, rear = vehicle.front.wheel.radius_m, vehicle.rear.wheel.radius_m
     if believed == 0:
         sign = 1.0 if used_mps >= 0.0 else -1.0
-        a, b, c, d = _rims(_times(sign, w), vehicle)
-        best = max(a, b, c, d) if demand_w < 0.0 else min(a, b, c, d)
+        rims = _rims(_times(sign, w), vehicle)
+        best = max(rims) if demand_w < 0.0 else min(rims)
         factor = abs(used_mps) / best if best > 0.0 else 0.0
         if LEAST_FACTOR < factor < 1.0 / LEAST_FACTOR:
             return _times(factor, w)
