@@ -106,7 +106,8 @@ def atomic_write(path: Path | str, data: bytes) -> None:
     """Write `data` so that a reader sees the old file or the whole new one, even after a power cut.
 
     The bytes go to a temporary file in the same folder, are forced to disk and renamed over `path`. An existing file
-    keeps its permissions; a symbolic link keeps pointing where it did.
+    keeps its permissions; a symbolic link keeps pointing where it did. To what is no file (a device, a pipe) they are
+    written as to any other.
 
     Raises
     ------
@@ -116,6 +117,9 @@ def atomic_write(path: Path | str, data: bytes) -> None:
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
+        if os.path.exists(path) and not os.path.isfile(path):
+            Path(path).write_bytes(data)
+            return
         mode = target.stat().st_mode & 0o777 if target.exists() else None
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         try:

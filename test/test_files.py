@@ -24,6 +24,17 @@ def test_a_write_replaces_the_file_and_leaves_nothing_else(tmp_path):
     assert files.sha256_of(path) == hashlib.sha256(b"new").hexdigest()
 
 
+def test_what_is_no_file_is_written_to_and_stays_what_it_is(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    files.atomic_write(tmp_path / "pipe", b"new")
+    assert os.read(reader, 10) == b"new"
+    os.close(reader)
+    assert (tmp_path / "pipe").is_fifo()
+    with pytest.raises(ConfigError, match="cannot be written: Is a directory"):
+        files.atomic_write(tmp_path, b"new")
+
+
 def test_the_hash_of_a_folder_changes_with_each_name_and_each_content_in_it(tmp_path):
     hashes = set()
     for name, content in (("a", b"1"), ("a", b"2"), ("b", b"2")):

@@ -64,9 +64,16 @@ def write_json(path: Path | str, values: Any) -> None:
 PICTURES = {".pdf": {"CreationDate": None}, ".png": {"Software": None}, ".svg": {"Date": None}}
 
 
+def output_file(text: str) -> str:
+    """Argument type of a file's name to write to; one in no folder is refused before anything is computed for it."""
+    if text != "-" and not Path(text).absolute().parent.is_dir():
+        raise argparse.ArgumentTypeError(f"{text} cannot be written: no such folder")
+    return text
+
+
 def picture(text: str) -> Path:
-    """Argument type of a picture's file name, refused before anything is computed for it."""
-    if Path(text).suffix.lower() not in PICTURES:
+    """Argument type of a picture's file name."""
+    if Path(output_file(text)).suffix.lower() not in PICTURES:
         raise argparse.ArgumentTypeError(f"{text} is no picture's name; allowed: ending in {', '.join(PICTURES)}")
     return Path(text)
 

@@ -101,9 +101,11 @@ def parser() -> argparse.ArgumentParser:
     )
     drive.add_argument("--friction", type=given.number(0.01, 2), default=0.9, metavar="MU", help="default: %(default)s")
     output = result.add_argument_group("output")
-    output.add_argument("--output", required=True, metavar="CSV", help="the cycle")
+    output.add_argument("--output", required=True, type=command.output_file, metavar="CSV", help="the cycle")
     output.add_argument("--plot", type=command.picture, metavar="PICTURE", help="log and cycle as .pdf, .png or .svg")
-    output.add_argument("--json", metavar="FILE", help="what was understood, with the numbers")
+    output.add_argument(
+        "--json", type=command.output_file, metavar="FILE", help="what was understood, with the numbers"
+    )
     output.add_argument("--quiet", action="store_true", help="print errors and warnings only")
     return result
 
@@ -134,6 +136,7 @@ def _import(options: argparse.Namespace) -> None:
     cycle = to_cycle(log, options.gaps, options.max_gap, options.smooth, options.rate)
     raw = to_cycle(log, options.gaps, options.max_gap, 0.0, 0.0)
     numbers = _numbers(options, log, cycle, raw, vehicle)
+    atomic_write(options.output, cycle_text(cycle, bool(options.grade)).encode())
     if not options.quiet:
         print(_text(options, log, numbers))
     invented_m = log.across_gaps_m(options.max_gap) if options.gaps == "bridge" else 0.0
@@ -143,7 +146,6 @@ def _import(options: argparse.Namespace) -> None:
         warnings.append(f"{share} are straight lines over gaps that nobody drove: --gaps cut leaves them out")
     for warning in warnings:
         print(f"import_cycle: warning: {warning}", file=sys.stderr)
-    atomic_write(options.output, cycle_text(cycle, bool(options.grade)).encode())
     if options.plot:
         _draw(options, log, raw, cycle)
     if options.json:

@@ -87,11 +87,13 @@ def parser() -> argparse.ArgumentParser:
     reach.add_argument("--max-power", type=given.number(0, 1e6), metavar="W")
     reach.add_argument("--top-speed", type=given.number(0, 20e3), metavar="RAD_S")
     output = result.add_argument_group("output")
-    output.add_argument("--output", required=True, metavar="CSV", help="the map")
+    output.add_argument("--output", required=True, type=command.output_file, metavar="CSV", help="the map")
     output.add_argument(
         "--plot", type=command.picture, metavar="PICTURE", help="the map, with points and gaps, as .pdf, .png or .svg"
     )
-    output.add_argument("--json", metavar="FILE", help="what was understood, with the numbers")
+    output.add_argument(
+        "--json", type=command.output_file, metavar="FILE", help="what was understood, with the numbers"
+    )
     output.add_argument("--quiet", action="store_true", help="print errors and warnings only")
     return result
 
@@ -143,11 +145,11 @@ def _import(options: argparse.Namespace) -> None:
         "lacks": lacking,
         "map": str(options.output),
     }
+    atomic_write(options.output, map_text(points).encode())
     if not options.quiet:
         print(_text(options, found, fit, numbers))
     for line in (*points.doubts, *(f"it lacks {line}" for line in lacking)):
         print(f"import_motor: warning: {line}", file=sys.stderr)
-    atomic_write(options.output, map_text(points).encode())
     if options.plot:
         _draw(options, found, reach)
     if options.json:

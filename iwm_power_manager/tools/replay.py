@@ -15,7 +15,7 @@ from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.control.strategies import drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import check_number
-from iwm_power_manager.tools.command import described, ended
+from iwm_power_manager.tools.command import described, ended, output_file
 from iwm_power_manager.tools.options import number, whole
 
 _DESCRIPTION = """\
@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         const="",
         help="energy this car would have taken, for each --strategy; default: the car of --vehicle, else of the bag",
     )
-    out.add_argument("--json", metavar="FILE", help="write the result as JSON; - for standard output")
+    out.add_argument("--json", type=output_file, metavar="FILE", help="write the result as JSON; - for standard output")
     out.add_argument("--quiet", action="store_true", help="no progress bar")
     play = parser.add_argument_group("publishing")
     seconds = number(0.0, 1e9)

@@ -42,7 +42,7 @@ from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.recorded import read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
-from iwm_power_manager.tools.command import described, ended, picture, write_json
+from iwm_power_manager.tools.command import described, ended, output_file, picture, write_json
 from iwm_power_manager.tools.options import several
 from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
@@ -124,7 +124,7 @@ def parser() -> argparse.ArgumentParser:
     output = result.add_argument_group("output")
     output.add_argument("--output", metavar="DIR|FILE", help="folder for the policies, or a .npz file for a single one")
     output.add_argument("--plot", type=picture, metavar="PICTURE", help="demand, convergence, policy: .pdf, .png, .svg")
-    output.add_argument("--json", metavar="FILE", help="the run's numbers; - for standard output")
+    output.add_argument("--json", type=output_file, metavar="FILE", help="the run's numbers; - for standard output")
     output.add_argument(
         "--export-mdp", metavar="NPZ", help="the exact problem, for another solver (one friction; docs/solver.md)"
     )

@@ -14,7 +14,7 @@ from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES
 from iwm_power_manager.model.parameters import IDLE_DRIVES
-from iwm_power_manager.tools.command import described, ended, picture
+from iwm_power_manager.tools.command import described, ended, output_file, picture
 from iwm_power_manager.tools.options import add_setting, number, several, whole
 from iwm_sim.study.names import DEFAULT_GRID, DEFAULT_POLICY, FIGURES, MAX_DT_S, NO_RESULTS, REFERENCE, TABLES, cores
 from iwm_sim.study.variants import VARIANTS
@@ -189,6 +189,7 @@ def _add_simulation(group: argparse._ArgumentGroup) -> None:
 def _add_output(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--json",
+        type=output_file,
         metavar="FILE",
         help="a row for each case, with settings and hashes; or what was asked for instead; - for standard output, "
         "with nothing else there",

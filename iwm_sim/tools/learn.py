@@ -26,7 +26,7 @@ from iwm_power_manager.policy import save_policy
 from iwm_power_manager.replay.recorded import read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import load_grid, targets
-from iwm_power_manager.tools.command import described, ended, made_with, write_json
+from iwm_power_manager.tools.command import described, ended, made_with, output_file, write_json
 from iwm_power_manager.tools.options import several, whole
 from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import load_vehicle
@@ -114,7 +114,7 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument(
         "--jobs", type=whole(1, 1024), default=cores(), metavar="N", help="processes (default: one for each core)"
     )
-    result.add_argument("--json", metavar="FILE", help="write the numbers, too")
+    result.add_argument("--json", type=output_file, metavar="FILE", help="write the numbers, too")
     result.add_argument("--quiet", action="store_true", help="print errors only")
     return result
 
