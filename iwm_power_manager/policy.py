@@ -46,9 +46,10 @@ from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import atomic_write, check_name, check_number, content_sha256
 from iwm_power_manager.mdp.budget import Trial
 from iwm_power_manager.mdp.demand import DemandChain, Source
-from iwm_power_manager.mdp.policy_iteration import GATED, Iteration, Solution, expect_over_demand
+from iwm_power_manager.mdp.policy_iteration import Iteration, Solution
 from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
 from iwm_power_manager.mdp.problem import Problem, problem_from
+from iwm_power_manager.mdp.sweep import GATED, expect_over_demand
 from iwm_power_manager.model.decision import (
     axles_gated,
 )

@@ -19,8 +19,9 @@ from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.mdp.budget import Trial, find_price
 from iwm_power_manager.mdp.certify import bellman_residual_j
 from iwm_power_manager.mdp.demand import DemandChain, Source
-from iwm_power_manager.mdp.policy_iteration import Iteration, Model, Solution, solve
+from iwm_power_manager.mdp.policy_iteration import Iteration, Solution, solve
 from iwm_power_manager.mdp.problem import Problem, load_problem
+from iwm_power_manager.mdp.sweep import Model
 from iwm_power_manager.mdp.transitions import build_model
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.policy import Policy, cost_quantum_j, make_policy, save_policy, with_residual

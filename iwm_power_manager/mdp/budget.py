@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iwm_power_manager.control.budget import changes_counted
-from iwm_power_manager.mdp.policy_iteration import GATED, Model, Solution, flow, solve
+from iwm_power_manager.mdp.policy_iteration import Solution, solve
 from iwm_power_manager.mdp.problem import price_matrix
+from iwm_power_manager.mdp.sweep import GATED, Model, flow
 
 #: The rate may miss the budget by this part.
 RATE_TOLERANCE = 0.03

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from iwm_power_manager.mdp.policy_iteration import Model, expect_over_demand, improve
+from iwm_power_manager.mdp.sweep import Model, expect_over_demand, improve
 
 
 def bellman_residual_j(model: Model, cost_j: NDArray[np.float64]) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iwm_power_manager.files import atomic_write
-from iwm_power_manager.mdp.policy_iteration import Model
+from iwm_power_manager.mdp.sweep import Model
 
 #: Control of a state without a choice.
 NO_CHOICE = -1

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from iwm_power_manager.grid import locate
 from iwm_power_manager.jit import kernel, parallel_kernel
-from iwm_power_manager.mdp.policy_iteration import Model, list_cells
 from iwm_power_manager.mdp.problem import Problem
+from iwm_power_manager.mdp.sweep import Model, list_cells
 from iwm_power_manager.mdp.threads import over_ranges
 from iwm_power_manager.model.chassis import equivalent_mass_kg, road_load_n
 from iwm_power_manager.model.decision import axles_gated, step_near, wheel_speed_of_state

@@ -10,8 +10,9 @@ import pytest
 
 from iwm_power_manager.mdp.budget import Occupancy, find_price
 from iwm_power_manager.mdp.demand import Source, chain_of
-from iwm_power_manager.mdp.policy_iteration import corner_steps, flow, solve
+from iwm_power_manager.mdp.policy_iteration import solve
 from iwm_power_manager.mdp.problem import load_problem, price_matrix
+from iwm_power_manager.mdp.sweep import corner_steps, flow
 from iwm_power_manager.mdp.transitions import build_model
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iwm_power_manager.mdp import policy_iteration as solver
-from iwm_power_manager.mdp.policy_iteration import GATED, TIE_J, certified_bound, dot, solve
+from iwm_power_manager.mdp.policy_iteration import certified_bound, solve
+from iwm_power_manager.mdp.sweep import GATED, TIE_J, dot
 from oracles.dense_mdp import dense, pack, policy_iteration, random_raw
 
 

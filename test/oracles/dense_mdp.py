@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iwm_power_manager.mdp.policy_iteration import Model, list_cells
+from iwm_power_manager.mdp.sweep import Model, list_cells
 
 
 class Raw(NamedTuple):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.mdp.policy_iteration import corner_steps
+from iwm_power_manager.mdp.sweep import corner_steps
 
 
 @kernel
