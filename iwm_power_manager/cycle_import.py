@@ -130,6 +130,9 @@ def read_log(
     clock = time_unit == "clock" or (time_unit == "auto" and _is_clock(table.rows[1:2], columns["time"]))
     left_out = 0
     for line, cells in table.rows[1:]:
+        if any(cells[len(header) :]):
+            problem = f"has {len(cells)} values: decimal commas between commas?"
+            raise ConfigError(path, f"line {line}", problem, f"{len(header)}, as in the header")
         row = {name: cells[i] if i < len(cells) else "" for name, i in columns.items()}
         if any(map(_is_nothing, row.values())):
             left_out += 1

@@ -295,6 +295,8 @@ def _hint(text: str) -> str:
         return ": write the digits 0 to 9"
     if re.fullmatch(r"[-+]?0[0-9xXoObB].*", text):
         return ": write it in decimal digits, without leading zeros"
+    if re.fullmatch(r"[-+]?[0-9]{1,3}(,[0-9]{3})+\.[0-9]+", text):
+        return ": write it without separators"
     if re.fullmatch(r"[-+]?[0-9]{1,3}([ '\u00a0\u2009\u202f_][0-9]+)+([.,][0-9]+)?", text):
         return ": write it without separators"
     if re.match(r"[-+]?[0-9.]+\s*[^\W\d_]", text):

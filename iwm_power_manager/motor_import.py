@@ -25,6 +25,8 @@ _OTHER_UNITS = {
 _TORQUE, _SPEED = re.compile("torque|moment|n ?m(?![a-z])", re.I), re.compile("speed|drehzahl|rpm|min|rad|omega", re.I)
 #: A map with so few of its grid's points is on no grid.
 _SPARSE = 0.25
+#: Half of a motor's map is never better.
+_TOO_GOOD = 0.99
 #: No car's motor has more, N m: those are speeds, or N mm.
 _MOST_NM = 5000.0
 
@@ -110,6 +112,10 @@ def read_points(
     most_nm = max((abs(torque) for _, torque in points), default=0.0) / gear
     if most_nm > _MOST_NM:
         doubts.append(f"torques up to {most_nm:g} N m at the motor: {'--down' if layout == 'matrix' else 'unit'}?")
+    known = sorted(value for value in points.values() if value > 0.0)
+    if known and known[len(known) // 2] > _TOO_GOOD:
+        meant = "losses in kW" if quantity == "loss" else "another quantity"
+        doubts.append(f"half of its efficiencies are above {_TOO_GOOD:g}: {meant}?")
     grid = len({speed for speed, _ in points}) * len({torque for _, torque in points})
     if len(points) < _SPARSE * grid:
         doubts.append(f"its points hardly lie on a grid: {len(points)} of {grid}")

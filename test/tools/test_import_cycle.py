@@ -193,6 +193,8 @@ def test_a_trace_the_car_cannot_follow_is_warned_of(tmp_path, capsys):
         ("Zeit_s;w\n0;0\n1;1\n", "has no column that looks like speed: name it with --speed; allowed: Zeit_s, w"),
         ("time_s,speed m/s\n0,0\n1,fast\n", "line 3, speed m/s: 'fast' is no number"),
         ("time_s,speed m/s\n0,0\n1,-9\n", "driving backwards is no cycle"),
+        ("time_s,speed m/s\n0,0,25\n1,0,75\n", "line 2: has 3 values: decimal commas between commas?; allowed: 2"),
+        ('time_s,speed m/s\n0,0\n1,"1,234.5"\n', "'1,234.5' is no number: write it without separators"),
         ("time_s,speed m/s\n0,0\n1,60\n", "no car does"),
         ("time,speed_kmh\n" + "".join(f"{t},50\n" for t in range(20)), "its time looks like driving in no unit"),
         ("time_s,speed m/s\n0,6\n0.1,0\n0.2,9\n1,9\n", "jumps by 9 m/s from one sample to the next"),

@@ -101,6 +101,14 @@ def test_losses_become_efficiencies(tmp_path, capsys):
     same(tmp_path / "map.csv")
 
 
+def test_losses_in_kw_are_warned_of(tmp_path, capsys):
+    rows = "".join(f"{w},{t},{1e-3 * (w * t / e - w * t)}\n" for w, t, e in points())
+    (tmp_path / "sheet.csv").write_text("speed,torque,loss\n" + rows)
+    code, _, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "map.csv", "--quantity", "loss")
+    assert code == 0
+    assert "half of its efficiencies are above 0.99: losses in kW?" in err
+
+
 def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys):
     code, _, err = run(capsys, MAP, "--output", tmp_path / "map.csv", *DEMANDS)
     assert code == 0
