@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -23,7 +22,7 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
@@ -56,6 +55,7 @@ from iwm_power_manager.ros.messages import (
 from iwm_power_manager.ros.parameters import Change, ParameterError, Spec, declare
 from iwm_power_manager.ros.raw import CLOCK_FIELDS, CLOCK_FIELDS_OFFSET, RawSubscriptions, Taken
 from iwm_power_manager.ros.remote_parameters import RemoteParameters
+from iwm_power_manager.ros.spinning import in_thread
 from iwm_power_manager.share import resolve
 from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, DEMANDS, PEDALS, load_mapping
 from iwm_power_manager.signals.types import definition_of
@@ -365,11 +365,6 @@ def _custom_data(values: Mapping[str, Any]) -> dict[str, str]:
     return custom
 
 
-def _spin(executor: SingleThreadedExecutor) -> None:
-    with suppress(ExternalShutdownException):
-        executor.spin()
-
-
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node until Ctrl-C or SIGTERM, or recover bags; returns the exit code."""
     arguments = list(sys.argv[1:] if args is None else args)
@@ -459,14 +454,9 @@ def _run_node(arguments: list[str]) -> int:
 def _record(node: Recorder, interruption: Interruption) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    spinning = threading.Thread(target=_spin, args=(executor,), name="executor", daemon=True)
-    spinning.start()
-    try:
+    with in_thread(executor, "executor"):
         node.run(interruption)
         node.finish()
-    finally:
-        executor.shutdown()
-        spinning.join()
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 from iwm_power_manager.command_line import CommandParser
@@ -284,11 +283,11 @@ def make_page(document: Any, feed: Feed) -> None:
     document.add_periodic_callback(refresh, REFRESH_MS)
 
 
-def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread, Any]:
-    """Hear state and diagnostics in a thread: the node, the thread, and its executor."""
+def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, Any]:
+    """Subscribe to state and diagnostics: the node, and an executor that is to be served in a thread."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
-    from rclpy.executors import ExternalShutdownException, InvalidHandle, SingleThreadedExecutor
+    from rclpy.executors import SingleThreadedExecutor
     from rclpy.node import Node
     from rclpy.signals import SignalHandlerOptions
     from sensor_msgs.msg import JointState
@@ -322,14 +321,7 @@ def listen(feed: Feed, arguments: Sequence[str]) -> tuple[Any, threading.Thread,
     node.create_timer(QUIET_S, looked)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-
-    def spin() -> None:
-        with suppress(ExternalShutdownException, InvalidHandle):  # the end may come while it waits
-            executor.spin()
-
-    thread = threading.Thread(target=spin, name="topics", daemon=True)
-    thread.start()
-    return node, thread, executor
+    return node, executor
 
 
 def serve(feed: Feed, port: int, *, open_browser: bool) -> None:
@@ -426,23 +418,23 @@ def main(args: Sequence[str] | None = None) -> int:
         print(_NO_BOKEH, file=sys.stderr)
         return FAILED
     from iwm_power_manager.ros import ending
+    from iwm_power_manager.ros.spinning import in_thread
 
     feed = Feed()
-    node, thread, executor = listen(feed, ["watch_car", *(options.node or []), *given[len(own) :]])
+    node, executor = listen(feed, ["watch_car", *(options.node or []), *given[len(own) :]])
     code = FAILED
     try:
-        if options.terminal:
-            print_reports(feed)
-        else:
-            serve(feed, options.port, open_browser=not options.no_browser)
+        with in_thread(executor, "topics"):
+            if options.terminal:
+                print_reports(feed)
+            else:
+                serve(feed, options.port, open_browser=not options.no_browser)
         code = DONE
     except IwmError as error:
         code = error.exit_code
         print(f"watch_car: {error}", file=sys.stderr)
     finally:
         with ending.bounded(code):
-            executor.shutdown()
-            thread.join(1.0)
             node.destroy_node()
             node = executor = None
     return code

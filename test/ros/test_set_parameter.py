@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
 
 import pytest
 import rclpy
@@ -18,6 +17,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 
 from iwm_power_manager.exit_codes import BAD_INPUT, FAILED
+from iwm_power_manager.ros.spinning import in_thread
 from iwm_power_manager.tools import set_parameter
 
 
@@ -123,11 +123,8 @@ def deaf_at_first():
         (ChangeState, change_state),
     ):
         node.create_service(kind, f"{node.get_name()}/{work.__name__}", losing(work), callback_group=group)
-    thread = threading.Thread(target=executor.spin, daemon=True)
-    thread.start()
-    yield node, asked, state
-    executor.shutdown()
-    thread.join()
+    with in_thread(executor, "deaf"):
+        yield node, asked, state
     node.destroy_node()
     rclpy.shutdown(context=context)
 

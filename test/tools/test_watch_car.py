@@ -124,7 +124,7 @@ def test_without_bokeh_each_way_to_it_is_named(
 
 def test_a_port_that_is_taken_is_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("bokeh")
-    monkeypatch.setattr(watch_car, "listen", lambda *_: (_Nothing(), _Nothing(), _Nothing()))
+    monkeypatch.setattr(watch_car, "listen", lambda *_: (_Nothing(), _Nothing()))
     import socket
 
     with socket.socket() as taken:
