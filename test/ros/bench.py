@@ -16,14 +16,13 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from member import Member
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.client import Client
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from iwm_power_manager.ros import ending, messages, qos
+from iwm_power_manager.ros import messages, qos
 from iwm_power_manager.ros.asking import AGAIN_S, Question
 
 PATIENCE_S = 60.0
@@ -105,15 +104,11 @@ class Running:
             raise AssertionError(f"did not end:\n{self.text()}") from None
 
 
-class Bench:
+class Bench(Member):
     """Publishes every input of the power manager and keeps every output."""
 
-    def __init__(self, domain: int, *, lockstep: bool = False, namespace: str = "", sim_time: bool = False) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=domain, args=[])
-        self.node = Node("bench", context=self.context, namespace=namespace, enable_rosout=False)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+    def __init__(self, *, lockstep: bool = False, namespace: str = "", sim_time: bool = False) -> None:
+        super().__init__("bench", namespace)
         self.sim_time = sim_time
         self.now_ns = 1_000_000_000
         profile = qos.profile(lockstep=lockstep)
@@ -149,13 +144,6 @@ class Bench:
         stamp, values = messages.read_named_numbers(message)
         self.states.append(values)
         self.state_stamps.append(stamp)
-
-    def close(self) -> None:
-        """Leave the domain."""
-        self.executor.shutdown()
-        with ending.one_processor():
-            self.node.destroy_node()
-            rclpy.shutdown(context=self.context)
 
     # Waiting
 

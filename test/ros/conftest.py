@@ -13,7 +13,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import member
 from bench import Bench, Running, arguments
+from member import domain
 
 from iwm_power_manager.ros import ending
 
@@ -39,20 +41,19 @@ class Pair:
         environment: dict[str, str] | None = None,
     ) -> None:
         Pair.count += 1
-        domain = int(os.environ["ROS_DOMAIN_ID"])
         namespace = f"/test_{os.getpid()}_{Pair.count}"
-        self.bench = Bench(domain, lockstep=bool(parameters.get("lockstep")), namespace=namespace, sim_time=sim_time)
+        self.bench = Bench(lockstep=bool(parameters.get("lockstep")), namespace=namespace, sim_time=sim_time)
         remaps = {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics", "/clock": f"{namespace}/clock"}
         given = {name.replace("{namespace}", namespace): value for name, value in parameters.items()}
         self.arguments = arguments({**EQUAL, **given, "use_sim_time": sim_time}, remaps)
         # The node as it is shipped, which shares no memory; only the bench announces itself more often than usual.
         self._environment = {"FASTRTPS_DEFAULT_PROFILES_FILE": "", **(environment or {})}
-        self._folder, self._domain = folder, domain
+        self._folder = folder
         self.running = self.start()
 
     def start(self) -> Running:
         """Start the node (again)."""
-        self.running = Running(MODULE, self.arguments, self._domain, self._folder, self._environment)
+        self.running = Running(MODULE, self.arguments, domain(), self._folder, self._environment)
         return self.running
 
     def close(self) -> None:
@@ -60,6 +61,12 @@ class Pair:
         self.bench.close()
         self.running.process.kill()
         self.running.process.wait()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _leaves_dds_last() -> Iterator[None]:
+    yield
+    member.leave()
 
 
 @pytest.fixture(scope="session")
@@ -110,7 +117,9 @@ def ros(compiled_law: None) -> Iterator[None]:
 
     parameters = {**EQUAL, "autostart": False}
     rclpy.init(args=arguments(parameters, {"__ns": "/here", "/diagnostics": "/here/diagnostics"}))
+    anchor = member.anchor()
     yield
+    anchor.destroy_node()
     rclpy.shutdown()
 
 

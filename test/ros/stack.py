@@ -7,23 +7,21 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from member import Member
 
-from iwm_power_manager.ros import ending, messages, qos
+from iwm_power_manager.ros import messages, qos
 
 PATIENCE_S = 60.0
 JOINTS, NUMBER, NUMBERS = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray"
 
 
-class Stack:
+class Stack(Member):
     """Publishes and hears topics of any type.
 
     Parameters
     ----------
-    domain, namespace : of the node
+    namespace : of the node
     sends : type of each topic it publishes
     hears : type of each topic it subscribes to
     reliability : of what it publishes
@@ -31,17 +29,12 @@ class Stack:
 
     def __init__(
         self,
-        domain: int,
         namespace: str,
         sends: Mapping[str, str],
         hears: Mapping[str, str],
         reliability: str = "best_effort",
     ) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=domain, args=[])
-        self.node = Node("stack", context=self.context, namespace=namespace, enable_rosout=False)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__("stack", namespace)
         offered = qos.profile(lockstep=False, reliability=reliability)
         self.publishers = {
             topic: self.node.create_publisher(messages.message_class(kind), topic, offered)
@@ -87,13 +80,6 @@ class Stack:
         if not self.diagnostics:
             return "no diagnostics"
         return "; ".join(f"{status.name}: {status.message}" for status in self.diagnostics[-1].status)
-
-    def close(self) -> None:
-        """Leave the domain."""
-        self.executor.shutdown()
-        with ending.one_processor():
-            self.node.destroy_node()
-            rclpy.shutdown(context=self.context)
 
 
 def number(value: float) -> Any:

@@ -66,7 +66,7 @@ def connect(tmp_path: Path, compiled_law: None, request: pytest.FixtureRequest) 
         **parameters: Any,
     ) -> Connected:
         name = f"/stack_{os.getpid()}_{abs(hash(request.node.name)) % 10**6}_{len(made)}"
-        stack = Stack(DOMAIN, name, sends, COMMANDS if hears is None else hears, reliability)
+        stack = Stack(name, sends, COMMANDS if hears is None else hears, reliability)
         made.append(Connected(tmp_path, name, text, stack, parameters, remaps or {}))
         return made[-1]
 
@@ -180,7 +180,7 @@ def test_wheels_on_topics_of_their_own_are_counted_however_slow_the_loop_is(conn
     assert "comes at" not in car.running.text()
 
     def slow() -> list[str]:
-        return [line for line in car.running.text().splitlines() if "comes at" in line and "WARN" in line]
+        return [line for line in car.running.text().splitlines() if ": comes at" in line and "WARN" in line]
 
     car.stack.drive(inputs, slow, "that they are slow", 0.25)
     car.stack.drive(inputs, lambda: len(states) > before + 80, "four more seconds", 0.25)
@@ -405,7 +405,7 @@ def test_what_it_waits_for_names_the_topic_the_reason_and_the_remedy(connect: Ca
         ),
         ({"  soc:": "  sox:"}, "signals.sox: is an unknown key"),
         ({"friction_torque: none": "friction_torque: nothing"}, "commands.friction_torque"),
-        ({"torque_3, type: std_msgs/msg/Float64": "torque_3, type: std_msgs/msg/Int32"}, "cannot hold 1 torques"),
+        ({"torque_3, type: std_msgs/msg/Float64": "torque_3, type: std_msgs/msg/UInt32"}, "cannot hold 1 torques"),
         (
             {"acceleration_demand": "accelerator_pedal", "m/s2": '"1"'},
             "the demand comes from accelerator_pedal; allowed: one of power_demand, force_demand",

@@ -165,7 +165,7 @@ def test_a_node_that_cannot_start_leaves_no_dds_to_the_end_of_the_interpreter(mo
 
 def test_a_node_that_has_run_leaves_no_dds_to_the_end_of_the_interpreter(compiled_law) -> None:
     namespace = f"/ending_{os.getpid()}"
-    bench = Bench(int(os.environ["ROS_DOMAIN_ID"]), namespace=namespace)
+    bench = Bench(namespace=namespace)
     given = arguments({"policy_file": "", "strategy": "equal"}, {"__ns": namespace})
     node = "iwm_power_manager.nodes.power_manager"
     process = subprocess.Popen([sys.executable, "-c", REMAINS, node, *given], stdout=subprocess.PIPE, text=True)
@@ -191,7 +191,7 @@ sys.exit(power_manager.main())
 def test_a_node_that_dds_does_not_let_go_ends_before_launch_loses_patience(compiled_law) -> None:
     """Launch waits 5 s before it prints errors and sends the next signal."""
     namespace = f"/held_fast_{os.getpid()}"
-    bench = Bench(int(os.environ["ROS_DOMAIN_ID"]), namespace=namespace)
+    bench = Bench(namespace=namespace)
     given = arguments({"policy_file": "", "strategy": "equal"}, {"__ns": namespace})
     process = subprocess.Popen([sys.executable, "-c", HELD_FAST, *given])
     try:

@@ -8,6 +8,7 @@ import math
 import pytest
 import rclpy
 import yaml
+from member import anchored
 from rclpy.parameter import Parameter
 
 from iwm_power_manager.control.thresholds import input_limits
@@ -192,8 +193,7 @@ def test_a_parameter_file_is_refused_exactly_where_ros_passes_over_it(tmp_path, 
     path = tmp_path / "params.yaml"
     path.write_text(f"{key}:\n  ros__parameters:\n    seen: 1\n")
     arguments = ["--ros-args", "--params-file", str(path)]
-    context = rclpy.Context()
-    rclpy.init(context=context, args=[])
+    context, _ = anchored()
     node = rclpy.create_node(
         "pm",
         context=context,
@@ -205,7 +205,6 @@ def test_a_parameter_file_is_refused_exactly_where_ros_passes_over_it(tmp_path, 
     )
     seen = node.has_parameter("seen")
     node.destroy_node()
-    rclpy.shutdown(context=context)
     if seen:
         check_parameter_files(arguments, "/car_1/pm")
     else:

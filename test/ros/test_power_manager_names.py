@@ -101,7 +101,7 @@ def test_two_cars_on_one_domain_do_not_meet(tmp_path: Path, compiled_law: None) 
     """Both with the shipped parameter file, one of them renamed; all on one /diagnostics."""
     params = str(resolve("config/nodes/power_manager.yaml"))
     names = [f"/car_{os.getpid()}_{i}" for i in range(2)]
-    benches = [Bench(DOMAIN, namespace=name) for name in names]
+    benches = [Bench(namespace=name) for name in names]
     heard: list[DiagnosticArray] = []
     benches[0].node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 100)
     states: list[Any] = []

@@ -93,7 +93,7 @@ def test_it_runs_from_its_parameter_file_in_a_namespace_with_remaps(tmp_path, co
     args = arguments({"strategy": "equal"}, {"__ns": "/car", "vehicle_speed": "/gps/speed"})
     args[1:1] = ["--params-file", params]
     running = Running(MODULE, args, DOMAIN, tmp_path)
-    bench = Bench(DOMAIN, namespace="/car")
+    bench = Bench(namespace="/car")
     try:
         bench.node.destroy_publisher(bench.publishers[messages.VEHICLE_SPEED])
         bench.publishers[messages.VEHICLE_SPEED] = bench.node.create_publisher(
@@ -123,7 +123,7 @@ def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, monkeypatch) -> None
 
 def test_services_are_answered_while_it_compiles(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("IWM_CACHE_DIR", str(tmp_path / "cache"))
-    bench = Bench(DOMAIN, namespace="/compiling")
+    bench = Bench(namespace="/compiling")
     running = Running(MODULE, arguments({"strategy": "equal"}, {"__ns": "/compiling"}), DOMAIN, tmp_path)
     try:
         assert bench.lifecycle_state() == "unconfigured"

@@ -14,12 +14,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistStamped
+from member import Member
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.highlevel import AnyReader
@@ -32,7 +30,6 @@ from disk_helpers import on_small_disk
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.exit_codes import BAD_INPUT
-from iwm_power_manager.ros import ending
 
 PATIENCE_S = 60.0
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -66,15 +63,11 @@ class RecorderProcess:
         return self.process.returncode, error
 
 
-class Peer:
+class Peer(Member):
     """A node in this process that publishes and listens."""
 
     def __init__(self) -> None:
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = Node("peer", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__("peer")
 
     def until(self, condition: Callable[[], bool], what: str) -> None:
         """Spin until a condition holds."""
@@ -101,12 +94,6 @@ class Peer:
         self.until(future.done, f"answer of {service}")
         self.node.destroy_client(client)
         return future.result()
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        with ending.one_processor():
-            self.node.destroy_node()
-            rclpy.shutdown(context=self.context)
 
 
 @pytest.fixture

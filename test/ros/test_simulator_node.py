@@ -12,16 +12,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from bench import Bench, Running, arguments
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from member import Member
 
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.exit_codes import BAD_INPUT, FAILED
 from iwm_power_manager.files import read_yaml
-from iwm_power_manager.ros import ending, qos
 from iwm_power_manager.ros import messages as m
+from iwm_power_manager.ros import qos
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import simulator
@@ -55,7 +53,7 @@ def hill(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-class StandIn:
+class StandIn(Member):
     """Listens to the simulator, and commands what `policy` makes of a set: motor and friction torques, or None."""
 
     count = 0
@@ -64,11 +62,7 @@ class StandIn:
         StandIn.count += 1
         self.namespace = f"/simulated_{os.getpid()}_{StandIn.count}"
         self.result = folder / "drive.npz"
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context, domain_id=DOMAIN, args=[])
-        self.node = Node("stand_in", context=self.context, namespace=self.namespace, enable_rosout=False)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        super().__init__("stand_in", self.namespace)
         profile = qos.profile(lockstep=lockstep)
         self.motors = self.node.create_publisher(m.JointState, m.WHEEL_TORQUE_COMMAND, profile)
         self.brakes = self.node.create_publisher(m.JointState, m.FRICTION_BRAKE_COMMAND, profile)
@@ -117,10 +111,7 @@ class StandIn:
         return load_run(self.result)
 
     def close(self) -> None:
-        self.executor.shutdown()
-        with ending.one_processor():
-            self.node.destroy_node()
-            rclpy.shutdown(context=self.context)
+        super().close()
         self.running.process.kill()
         self.running.process.wait()
 
@@ -364,11 +355,8 @@ def test_a_signal_ends_it_cleanly(stand_in, number) -> None:
 
 
 def test_topics_follow_namespace_and_remaps(tmp_path, hill) -> None:
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=DOMAIN, args=[])
-    node = Node("onlooker", context=context, enable_rosout=False)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
+    onlooker = Member("onlooker")
+    node = onlooker.node
     space = f"/car_{os.getpid()}"
     running = Running(
         MODULE,
@@ -377,10 +365,9 @@ def test_topics_follow_namespace_and_remaps(tmp_path, hill) -> None:
         tmp_path,
     )
     try:
-        bench = type("Spinner", (), {"executor": executor})()
         expected = {f"{space}/speed_over_ground", f"{space}/wheel_states", f"{space}/power_demand"}
         Bench.spin_until(
-            bench,
+            onlooker,
             lambda: (
                 expected <= {name for name, _ in node.get_publisher_names_and_types_by_node("virtual_car", space)}
                 if ("virtual_car", space) in node.get_node_names_and_namespaces()
@@ -392,10 +379,7 @@ def test_topics_follow_namespace_and_remaps(tmp_path, hill) -> None:
     finally:
         running.process.kill()
         running.process.wait()
-        executor.shutdown()
-        with ending.one_processor():
-            node.destroy_node()
-            rclpy.shutdown(context=context)
+        onlooker.close()
 
 
 def test_the_shipped_parameter_file_holds_its_defaults() -> None:

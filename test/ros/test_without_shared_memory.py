@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from bench import Bench, Running, arguments
+from member import domain
 
 from campaigns import soak
 from iwm_power_manager.ros.transport import leave_shared_memory
@@ -19,14 +20,14 @@ LOCAL = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 def test_it_drives_and_is_heard_and_shares_memory_only_if_asked_to(
     tmp_path: Path, compiled_law: None, more: dict[str, str], shares: bool
 ) -> None:
-    domain, namespace = int(os.environ["ROS_DOMAIN_ID"]), f"/without_shared_memory_{os.getpid()}"
+    namespace = f"/without_shared_memory_{os.getpid()}"
     # The bench runs with LOCALHOST, as all tests do, and has shared memory.
-    bench = Bench(domain, namespace=namespace)
+    bench = Bench(namespace=namespace)
     args = arguments(
         {"strategy": "equal", "policy_file": ""}, {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics"}
     )
     environment = {"FASTRTPS_DEFAULT_PROFILES_FILE": "", **more}
-    running = Running("iwm_power_manager.nodes.power_manager", args, domain, tmp_path, environment)
+    running = Running("iwm_power_manager.nodes.power_manager", args, domain(), tmp_path, environment)
     try:
         bench.connect()
         bench.drive(lambda: bench.states and bench.states[-1]["mode"] == 1.0, "the normal mode")
