@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from bench import PATIENCE_S, Bench
+from geometry_msgs.msg import Point, PointStamped
 from sensor_msgs.msg import JointState
 
 from iwm_power_manager.ros import messages, qos
@@ -16,6 +17,8 @@ MASS_KG, RADIUS_M, LOAD_N = 820.0, 0.33, 450.0
 #: As real motor controllers have it: torque ends when no command comes.
 TIME_OUT_S = 0.1
 _PERIOD_S = 0.01
+#: How a signals file names the demand of a `SteppedCar`, which has a stamp: a Float64 is judged by the machine's clock.
+STAMPED_DEMAND = "{topic: stamped_demand, type: geometry_msgs/msg/PointStamped, field: point.x"
 
 
 class Heard(NamedTuple):
@@ -99,4 +102,41 @@ class RollingCar:
                 beside()
                 due = max(due + _PERIOD_S, now)
             self.bench.executor.spin_once(timeout_sec=max(due - time.monotonic(), 0.0))
+        return found
+
+
+class SteppedCar(RollingCar):
+    """The car in simulated time, which waits for each step: what it measures does not depend on the machine."""
+
+    def __init__(self, bench: Bench, speed_mps: float) -> None:
+        super().__init__(bench, speed_mps)
+        self._demand = bench.node.create_publisher(PointStamped, "stamped_demand", qos.profile(lockstep=False))
+
+    def force_n(self) -> float:
+        """What the last commands make of the road."""
+        return sum(heard[-1].torque_nm for heard in (self.motors, self.brakes) if heard) / RADIUS_M
+
+    def roll(
+        self,
+        condition: Callable[[], Any],
+        what: str,
+        demand_w: Callable[[], float],
+        beside: Callable[[], None] = lambda: None,
+        patience_s: float = PATIENCE_S,
+    ) -> Any:
+        """As a `RollingCar` does, a period for each step that is answered."""
+        bench, began = self.bench, time.monotonic()
+        while not (found := condition()):
+            assert time.monotonic() - began < patience_s, f"waited in vain for {what}; {self.situation()}"
+            self.speed_mps = max(self.speed_mps + (self.force_n() - LOAD_N) / MASS_KG * _PERIOD_S, 2.0)
+            bench.now_ns += int(_PERIOD_S * 1e9)
+            stamp_ns = bench.send(speed=self.speed_mps, without=(messages.POWER_DEMAND,))
+            demand = PointStamped(point=Point(x=demand_w()))
+            demand.header.stamp = messages.ns_to_stamp(stamp_ns)
+            self._demand.publish(demand)
+            beside()
+            bench.publish(messages.CLOCK, messages.clock_message(stamp_ns))
+            until = time.monotonic() + (1.0 if bench.states else _PERIOD_S)  # one that is lost is not waited for
+            while time.monotonic() < until and bench.state_stamps[-1:] < [stamp_ns]:
+                bench.executor.spin_once(timeout_sec=until - time.monotonic())
         return found
