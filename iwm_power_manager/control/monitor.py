@@ -159,6 +159,9 @@ class Tally:
                 more += ", no stamp? then stamp: source; simulated time? then use_sim_time for both"
             elif self.stamp_off_s > _OTHER_CLOCK_S:
                 more += ", another clock? then stamp: source"
+        elif self.violation is Violation.TOO_FAST and self.refused:
+            value, limits = self.refused
+            more = f"{value:g}; allowed: a change of {min(limits.rise_per_s, limits.fall_per_s):g} a second"
         return self.violation.name.lower().replace("_", " ") + (f": {more}" if more else "")
 
     def described(self) -> str:

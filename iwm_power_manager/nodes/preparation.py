@@ -119,7 +119,9 @@ def _interface(
         types[source.topic] = types_of(source.type)
     for sink in (sink for sinks in mapping.commands.values() for sink in sinks):
         _check_installed(mapping.path, sink.key, sink.type)
-    commands = {kind: CommandWriter(mapping.path, sinks) for kind, sinks in mapping.commands.items()}
+    axles = (vehicle.params.front, vehicle.params.rear)
+    most_nm = max(max(axle.motor.peak_torque_nm, axle.friction_brake.max_torque_nm) for axle in axles)
+    commands = {kind: CommandWriter(mapping.path, sinks, most_nm) for kind, sinks in mapping.commands.items()}
     readers = topic_readers(mapping, types, assembly)
     assembly.warm(mapping.sources)
     limits = f"demand_min_w {demand.minimum:g} to demand_max_w {demand.maximum:g}"

@@ -385,7 +385,7 @@ class MessageWriter:
     ----------
     types : of the message
     template : its CDR bytes, little-endian, the field as long as it will be
-    field : path of the number or array of numbers
+    field : path of the number or array of numbers; whole ones with a sign are rounded
     """
 
     def __init__(self, types: Types, template: bytes, field: str) -> None:
@@ -395,12 +395,14 @@ class MessageWriter:
         self._stamp = struct.Struct("<iI")
         self._numbers = struct.Struct(f"<{part.length}{part.code}")
         self._start = part.begin
+        self._whole = part.code in "bhiq"
 
     def __call__(self, stamp_ns: int, values: Sequence[float]) -> bytes:
         """The message's CDR bytes."""
         data = bytearray(self._template)
         if self._stamped:
             self._stamp.pack_into(data, _BODY, stamp_ns // _NS_PER_S, stamp_ns % _NS_PER_S)
+        values = [round(value) for value in values] if self._whole else values
         self._numbers.pack_into(data, self._start, *values)
         return bytes(data)
 

@@ -167,14 +167,19 @@ def signs(file: Path, key: str, sign: Any, *, wheels: bool) -> tuple[float, ...]
 class CommandWriter:
     """Four torques to the bytes of the messages that carry them.
 
+    Parameters
+    ----------
+    file, sinks : of one command
+    most_nm : largest torque, either way, that the messages have to hold
+
     Raises
     ------
     ConfigError
         A type is not known, or a field is not there or cannot hold torques.
     """
 
-    def __init__(self, file: Path, sinks: Sequence[Sink]) -> None:
-        self._writers = [(sink.topic, parts_of(sink), _writer(file, sink)) for sink in sinks]
+    def __init__(self, file: Path, sinks: Sequence[Sink], most_nm: float = 0.5) -> None:
+        self._writers = [(sink.topic, parts_of(sink), _writer(file, sink, most_nm)) for sink in sinks]
 
     def __call__(self, stamp_ns: int, torque_nm: Sequence[float]) -> list[tuple[str, bytes]]:
         """Topic and bytes of each message."""
@@ -189,7 +194,7 @@ def parts_of(sink: Sink) -> list[tuple[int, float]]:
     return [(wheel, sink.factors[wheel if len(sink.factors) > 1 else 0]) for wheel in sink.wheels]
 
 
-def _writer(file: Path, sink: Sink) -> MessageWriter:
+def _writer(file: Path, sink: Sink, most_nm: float) -> MessageWriter:
     try:
         types = types_of(sink.type)
     except BagError as error:
@@ -204,11 +209,12 @@ def _writer(file: Path, sink: Sink) -> MessageWriter:
         )
     writer = MessageWriter(types, _template(file, types, sink), sink.field)
     try:
-        writer(0, [0.5] * len(sink.wheels))
+        for sign in (-1.0, 1.0):
+            writer(0, [sign * factor * most_nm for _, factor in parts_of(sink)])
     except struct.error:
-        raise ConfigError(
-            file, dotted(sink.key, "field"), f"{sink.field} cannot hold {len(sink.wheels)} torques"
-        ) from None
+        problem = f"{sink.field} cannot hold {len(sink.wheels)} torques of up to {most_nm:g} N m with their factor"
+        allowed = "a float for each wheel, or a whole number with a sign that is large enough"
+        raise ConfigError(file, dotted(sink.key, "field"), problem, allowed) from None
     return writer
 
 

@@ -7,7 +7,7 @@
                     names: [fl, fr, rl, rr], sign: [1, -1, 1, -1]}
       power_demand: {topic: /demand, type: std_msgs/msg/Float64, field: data, unit: kW, factor: -1}
 
-Every signal ends up in SI units: value * factor * sign + offset, then the unit. A bag knows its own types, so that
+Every signal ends up in SI units: (value * factor + offset) * sign, then the unit. A bag knows its own types, so that
 `type` may be left out there; live it is needed. docs/connect.md explains every key.
 """
 
@@ -112,7 +112,7 @@ class Source(NamedTuple):
     field : path of the number in the message, such as `twist.linear.x` or `data[2]`
     unit : of the value after `factor`, `signs` and `offset`
     type : of the message; "" where the bag says it
-    factor, offset : applied in the message's unit
+    factor, offset : applied in the message's unit, with the sign that is in common
     signs : +1 or -1 for each of four wheels; () for all +1
     names : of the four wheels in the order of this project, to be found in the message's field `name`; () if the field
         is a single number or an array in the right order
@@ -275,12 +275,14 @@ def _source(file: Path, key: str, signal: str, entry: Any, *, wheels: bool = Fal
     unit = check_choice(file, dotted(key, "unit"), values["unit"], units)
     sign = signs(file, dotted(key, "sign"), values.get("sign", 1), wheels=wheels)
     factor = check_factor(file, dotted(key, "factor"), values.get("factor", 1.0))
+    offset = check_number(file, dotted(key, "offset"), values.get("offset", 0.0), -_OFFSET, _OFFSET)
+    common = sign[0] if len(set(sign)) == 1 else 1.0
     return Source(
         key=key,
         **place(file, key, values),
         unit=units[unit],
-        factor=factor * sign[0] if len(set(sign)) == 1 else factor,
-        offset=check_number(file, dotted(key, "offset"), values.get("offset", 0.0), -_OFFSET, _OFFSET),
+        factor=factor * common,
+        offset=offset * common,
         signs=sign if len(set(sign)) > 1 else (),
         names=wheel_names(file, dotted(key, "names"), values["names"]) if "names" in values else (),
         qos=check_choice(file, dotted(key, "qos"), values.get("qos", "best_effort"), RELIABILITIES),

@@ -73,6 +73,23 @@ def test_wheels_of_an_array_may_have_a_factor_each(tmp_path: Path) -> None:
     assert list(found.data) == [-32.0, -1.0, 4.0, -14.0]
 
 
+def test_whole_numbers_are_rounded_and_have_to_hold_the_largest_torque(tmp_path: Path) -> None:
+    """As gateways to a CAN bus have them: tenths of N m in an Int16."""
+    entry = "{topic: a, type: std_msgs/msg/Int16MultiArray, field: data, unit: N m, factor: -10}"
+    write = writer(tmp_path, entry)[MOTOR]
+    ((_, data),) = write(0, (200.04, -0.06, 0.0, -80.0))
+    assert list(deserialize_message(data, messages.message_class("std_msgs/msg/Int16MultiArray")).data) == [
+        -2000,
+        1,
+        0,
+        800,
+    ]
+    sinks = load_mapping(tmp_path / "signals.yaml").commands[MOTOR]
+    CommandWriter(FILE, sinks, 3276.7)
+    with pytest.raises(ConfigError, match=r"cannot hold 4 torques of up to 3300 N m with their factor"):
+        CommandWriter(FILE, sinks, 3300.0)
+
+
 def test_names_follow_the_order_of_the_array(tmp_path: Path) -> None:
     write = writer(
         tmp_path,
@@ -100,7 +117,7 @@ def test_four_topics_carry_a_wheel_each_and_none_carries_nothing(tmp_path: Path)
         ("none", "commands.motor_torque"),
         ("{topic: a, type: std_msgs/msg/Float64, field: data, unit: N m}", "has no array data"),
         ("{topic: a, type: std_msgs/msg/Float64MultiArray, field: date, unit: N m}", "commands.motor_torque.field"),
-        ("{topic: a, type: std_msgs/msg/Int32MultiArray, field: data, unit: N m}", "data cannot hold 4 torques"),
+        ("{topic: a, type: std_msgs/msg/UInt32MultiArray, field: data, unit: N m}", "data cannot hold 4 torques"),
         ("{topic: a, type: nobody_msgs/msg/None, field: data, unit: N m}", "commands.motor_torque.type"),
         ("{topic: a, type: std_msgs/msg/Float64MultiArray, field: data, unit: Nm}", "'Nm' is unknown; allowed: N m"),
         ("{topic: a, type: std_msgs/msg/Float64MultiArray, field: data, unit: N m, factor: 0}", "0 is out of"),

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import BatteryState, JointState
-from std_msgs.msg import Float64
+from std_msgs.msg import Float64, Int16, Int16MultiArray
 
 from iwm_power_manager.control.inputs import Violation, check_names
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
@@ -183,6 +183,20 @@ def test_speed_from_any_numeric_field_in_its_unit(tmp_path: Path, msgtype: str, 
         (found,) = quick(serialize_message(sent), 77)
         assert isinstance(found, SpeedReading)
         assert found == (0 if quick.stamped else 77, pytest.approx(5.0))
+
+
+@pytest.mark.parametrize("sign", ["[-1, -1, -1, -1]", "[1, 1, 1, -1]", "-1"])
+def test_a_sign_turns_the_number_with_its_offset_around(tmp_path: Path, sign: str) -> None:
+    """In an array and alone: counts of an encoder whose zero is not the wheel's."""
+    text = f"{{topic: w, type: T, field: data, unit: rad/s, factor: 0.5, offset: 100, sign: {sign}}}"
+    quick = read_from(tmp_path, "  wheel_speed: " + text.replace("T,", "std_msgs/msg/Int16MultiArray,"))["w"]
+    (found,) = quick(serialize_message(Int16MultiArray(data=[0, 0, 0, -220])), 7)
+    assert isinstance(found, JointReading)
+    assert found.values[3] == 10.0
+    alone = text.replace("T,", "std_msgs/msg/Int16,").replace(sign, "-1").replace("rad/s", "km/h")
+    (speed,) = read_from(tmp_path, "  speed: " + alone)["w"](serialize_message(Int16(data=-220)), 7)
+    assert isinstance(speed, SpeedReading)
+    assert speed.speed_mps == pytest.approx(10.0 / 3.6)
 
 
 def test_wheels_are_found_by_name_and_carry_the_controllers_names(tmp_path: Path) -> None:
