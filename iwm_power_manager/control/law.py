@@ -334,12 +334,12 @@ def _limits(wheel: Wheel, given: Given, short: bool, braking: bool, axle: Axle) 
 
 
 @kernel
-def _friction_nm(given: Given, delivered_nm: float, braking: bool, axle: Axle) -> float:
+def _friction_nm(given: Given, gated: bool, delivered_nm: float, braking: bool, axle: Axle) -> float:
     """Friction torque that makes up, with what the motor delivers, the braking torque asked for.
 
-    A motor that is still on its way down from driving is held against: braking gets through at once.
+    A motor that is still on its way down from driving, or stuck, is held against: braking gets through at once.
     """
-    if not braking:
+    if not braking or gated:
         return given.friction_nm
     return max(min(given.total_nm - delivered_nm, 0.0), -axle.friction_brake.max_torque_nm)
 
@@ -572,13 +572,15 @@ def _arrived_nm(delivered: Wheels, friction: Wheels, gain: Wheels) -> Wheels:
 
 
 @kernel
-def _frictions_nm(front: Shared, rear: Shared, delivered_nm: Wheels, braking: bool, vehicle: VehicleParams) -> Wheels:
+def _frictions_nm(
+    front: Pair, f: Shared, rear: Pair, r: Shared, delivered_nm: Wheels, braking: bool, vehicle: VehicleParams
+) -> Wheels:
     """Friction torque of each wheel."""
     return (
-        _friction_nm(front.left, delivered_nm[0], braking, vehicle.front),
-        _friction_nm(front.right, delivered_nm[1], braking, vehicle.front),
-        _friction_nm(rear.left, delivered_nm[2], braking, vehicle.rear),
-        _friction_nm(rear.right, delivered_nm[3], braking, vehicle.rear),
+        _friction_nm(f.left, front.left.gated, delivered_nm[0], braking, vehicle.front),
+        _friction_nm(f.right, front.right.gated, delivered_nm[1], braking, vehicle.front),
+        _friction_nm(r.left, rear.left.gated, delivered_nm[2], braking, vehicle.rear),
+        _friction_nm(r.right, rear.right.gated, delivered_nm[3], braking, vehicle.rear),
     )
 
 
@@ -644,7 +646,7 @@ def _commanded(
         limits |= LIMIT_BATTERY_CHARGE if power < 0.0 else LIMIT_BATTERY_DISCHARGE
     motor = (scale * wanted[0], scale * wanted[1], scale * wanted[2], scale * wanted[3])
     delivered = _delivered_nm(motor, measurement.motor_gain, measurement.motor_stuck_nm)
-    friction = _frictions_nm(f, r, delivered, braking, vehicle)
+    friction = _frictions_nm(front, f, rear, r, delivered, braking, vehicle)
     fl_nm, fr_nm, rl_nm, rr_nm = _arrived_nm(delivered, friction, state.motion.brake_gain)
     gate = (1 if front_gated else 0) + (2 if rear_gated else 0)
     command = Command(

@@ -16,7 +16,9 @@ once whether the forces or the speeds are right.
 
 A wheel is not believed when it does what no torque can: slows down faster than its brake can, or stays away from the
 car's speed although nothing holds it. A wheel that skids does neither. Four that jump by one factor while the sensor
-does not are corrected by it: no road loses its grip under both axles in the same step.
+does not are corrected by it: no road loses its grip under both axles in the same step. Where sensor and wheels have
+differed by one factor ever since they first rolled freely, nothing tells which is wrong: the wheels are turned into the
+sensor's speed, so that slip is slip, and a power that brakes is divided by the lower of both.
 """
 
 from __future__ import annotations
@@ -24,7 +26,15 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from iwm_power_manager.control.types import Agreed, FourWheels, Measurement, MotionState, Wheels, WheelState
+from iwm_power_manager.control.types import (
+    Agreed,
+    Compared,
+    FourWheels,
+    Measurement,
+    MotionState,
+    Wheels,
+    WheelState,
+)
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.parameters import Axle, VehicleParams, Wheel
@@ -92,6 +102,10 @@ LEAST_PART = 0.72
 #: of 1 is tyre wear. What they jump by in the same step, rad/s, and how far their factors may be apart.
 LEAST_FACTOR, WORN_PART = 0.6, 0.05
 COMMON_RADPS, COMMON_PART, CALM_S = 0.5, 0.03, 0.05
+#: Sensor and wheels are compared when these first roll freely, or differ from it against their torques, for this long
+#: and faster than this. Beyond the last speed a sensor that is off by 5 m/s would look like one that is wrong by a
+#: factor, and the wheels are believed.
+COMPARED_S, COMPARED_MPS, COMPARED_MOST_MPS = 0.2, 2.0, 12.5
 #: No road force is larger than this part of the wheel's static load.
 MOST_FRICTION = 2.0
 #: Bits of `Motion.doubted`: the wheels in their order, then the speed sensor.
@@ -201,6 +215,13 @@ class _Rolling(NamedTuple):
 
 
 @kernel
+def _used_friction(torque_nm: Wheels, t: _Turning) -> float:
+    """The largest of four torques at the wheels, as part of the wheel's load."""
+    a, b, c, d = torque_nm
+    return max(max(abs(a), abs(b)) / t.front_nm, max(abs(c), abs(d)) / t.rear_nm)
+
+
+@kernel
 def _rolling(rims: Wheels, doubt_s: Wheels, turning: _Turning) -> _Rolling:
     count = 0
     low = math.inf
@@ -212,9 +233,7 @@ def _rolling(rims: Wheels, doubt_s: Wheels, turning: _Turning) -> _Rolling:
             low = min(low, rims[i])
             high = max(high, rims[i])
             total += rims[i]
-    road = turning.road_nm
-    front_used = max(abs(road[0]), abs(road[1])) / turning.front_nm
-    used = max(front_used, max(abs(road[2]), abs(road[3])) / turning.rear_nm)
+    used = _used_friction(turning.road_nm, turning)
     agree = count >= 3 and high - low <= AGREE_PART * abs(high) + AGREE_MPS
     mean = total / max(count, 1)
     nearly = agree and (used < NEARLY_FRICTION or abs(high) < NEARLY_MPS)
@@ -222,8 +241,13 @@ def _rolling(rims: Wheels, doubt_s: Wheels, turning: _Turning) -> _Rolling:
 
 
 @kernel
+def _same(shown: float, mean_mps: float) -> bool:
+    return abs(shown - mean_mps) <= CONFIRMED_PART * abs(shown) + CONFIRMED_MPS
+
+
+@kernel
 def _confirmed(shown: float, rolling: _Rolling) -> bool:
-    return rolling.believed >= 3 and abs(shown - rolling.mean_mps) <= CONFIRMED_PART * abs(shown) + CONFIRMED_MPS
+    return rolling.believed >= 3 and _same(shown, rolling.mean_mps)
 
 
 class _Sensor(NamedTuple):
@@ -315,11 +339,19 @@ def _started(shown: float, rims: Wheels) -> MotionState:
     start = _middle(rims)
     if not math.isnan(shown) and abs(shown - start) <= SPEED_PART * abs(start) + SPEED_MPS:
         start = shown
-    return _fresh(start, 0.0, shown, WHOLE_BRAKES)
+    return _fresh(start, 0.0, shown, WHOLE_BRAKES, 1.0, Compared(1.0, 0.0), 0.0)
 
 
 @kernel
-def _fresh(speed_mps: float, bias_mps2: float, shown_mps: float, brake_gain: Wheels) -> MotionState:
+def _fresh(
+    speed_mps: float,
+    bias_mps2: float,
+    shown_mps: float,
+    brake_gain: Wheels,
+    factor: float,
+    compared: Compared,
+    wheel_doubt_s: float,
+) -> MotionState:
     """A reference that nothing contradicts."""
     return MotionState(
         speed_mps=speed_mps,
@@ -330,11 +362,12 @@ def _fresh(speed_mps: float, bias_mps2: float, shown_mps: float, brake_gain: Whe
         apart_s=0.0,
         doubt_s=0.0,
         wheel_stray_s=NO_WHEELS,
-        wheel_doubt_s=NO_WHEELS,
+        wheel_doubt_s=(wheel_doubt_s, wheel_doubt_s, wheel_doubt_s, wheel_doubt_s),
         agreed=Agreed(0.0, 0.0, 0.0, 0.0),
         brake_gain=brake_gain,
-        wheels_factor=1.0,
+        wheels_factor=factor,
         calm_s=0.0,
+        compared=compared,
     )
 
 
@@ -430,7 +463,7 @@ def _voted(
     if old.lasted_s > 0.0:
         felt = measurement.acceleration_mps2 * dt
         agreed = Agreed(old.lasted_s + dt, old.from_mps, old.moved_mps + acceleration * dt, old.felt_mps + felt)
-    used = max(max(abs(torque[0]), abs(torque[1])) / t.front_nm, max(abs(torque[2]), abs(torque[3])) / t.rear_nm)
+    used = _used_friction(torque, t)
     # A driven wheel is never slower than the car, a braked one never faster; no skid makes a wheel doubted.
     slip = own_nm * (mean - predicted) > 0.0 and not (all_doubted and used < ROLLING_FRICTION)
     # What an accelerometer says, a slope taken off as the forces have it.
@@ -481,14 +514,16 @@ def _restarted(
 ) -> MotionState:
     """The reference from speeds that are right, and what that makes of the forces: brakes that are weak, or a slope."""
     missed = (mean - agreed.from_mps - agreed.moved_mps) / agreed.lasted_s
+    factor, told = before.wheels_factor, before.compared
     if abs(missed) <= BIAS_MPS2:
-        return _fresh(mean, before.bias_mps2, shown, before.brake_gain)
+        return _fresh(mean, before.bias_mps2, shown, before.brake_gain, factor, told, 0.0)
     sign = 1.0 if mean >= 0.0 else -1.0
     lack = sign * missed
     if lack < 0.0 and min(before.brake_gain) < 1.0:
-        return _fresh(mean, before.bias_mps2, shown, WHOLE_BRAKES)  # they are back
+        return _fresh(mean, before.bias_mps2, shown, WHOLE_BRAKES, factor, told, 0.0)  # they are back
     gain, found = _weak_brakes(lack, mean, rims, wheels, t, before.brake_gain, vehicle)
-    return _fresh(mean, _clamped(before.bias_mps2 + sign * (lack - found), MOST_MPS2), shown, gain)
+    bias = _clamped(before.bias_mps2 + sign * (lack - found), MOST_MPS2)
+    return _fresh(mean, bias, shown, gain, factor, told, 0.0)
 
 
 @kernel
@@ -692,21 +727,21 @@ def estimate(
     demand = measurement.power_demand_w
     reference = _pulled(sensor.predicted_mps, shown, trusted, rolling, demand, forces, dt)
     used = shown if trusted else reference
-    part = 1.0
-    if not (trusted or math.isnan(shown)) and abs(reference) > SLOW_MPS:
-        ratio = shown / reference
-        if LEAST_PART < ratio < 1.0:
-            part = ratio
     motion = Motion(
         speed_mps=used,
         uncertainty_mps=0.1 + SPEED_PART * abs(used) if trusted else SPEED_MPS + 2.0 * WHEEL_PART * abs(used),
         wheel_speed_radps=_used_wheels(w, doubt, used, rolling.believed, demand, vehicle),
-        lower_part=part,
+        lower_part=_lower_part(shown, reference, trusted, before.compared),
         doubted=_doubted(trusted, doubt, factor),
     )
+    bias = _bias_mps2(before.bias_mps2, shown, sensor.predicted_mps, trusted, rolling, dt)
+    compared, told, anew = _compared(shown, rims, turning, sensor.apart_s, factor, before.compared, dt)
+    if anew:
+        # In the next step the wheels change without a torque.
+        return motion, _fresh(_mean(rims) * told / factor, bias, shown, before.brake_gain, told, compared, dt)
     after = MotionState(
         speed_mps=reference,
-        bias_mps2=_bias_mps2(before.bias_mps2, shown, sensor.predicted_mps, trusted, rolling, dt),
+        bias_mps2=bias,
         shown_mps=shown,
         shown_s=sensor.shown_s,
         moved_mps=sensor.moved_mps,
@@ -718,8 +753,53 @@ def estimate(
         brake_gain=before.brake_gain,
         wheels_factor=factor,
         calm_s=calm_s,
+        compared=compared,
     )
     return motion, after
+
+
+@kernel
+def _compared(
+    shown: float, rims: Wheels, t: _Turning, apart_s: float, factor: float, before: Compared, dt: float
+) -> tuple[Compared, float, bool]:
+    """What sensor and wheels have said of each other by now, the wheels' factor, and whether all begins anew by it."""
+    mean = _mean(rims)
+    slow = math.isnan(shown) or min(abs(shown), abs(mean)) <= COMPARED_MPS or shown * mean < 0.0
+    agree = max(rims) - min(rims) <= AGREE_PART * abs(mean) + AGREE_MPS
+    freely = _used_friction(t.road_nm, t) < ROLLING_FRICTION
+    if slow or not agree or not (freely or _mean(t.torque_nm) * (mean - shown) < 0.0):
+        return before, factor, False
+    if before.lasted_s >= COMPARED_S:
+        # Wheels that show by themselves what the sensor does are right again; a wrong sensor is not wrong by a factor.
+        over = freely and _unsure(before) and (_same(shown, mean / factor) or apart_s > APART_S)
+        return (Compared(1.0, before.lasted_s), 1.0, True) if over else (before, factor, False)
+    lasted_s = before.lasted_s + dt
+    ratio = before.ratio + dt / lasted_s * (shown / mean - before.ratio)
+    if lasted_s < COMPARED_S:
+        return Compared(ratio, lasted_s), factor, False
+    same = abs(ratio - 1.0) <= WORN_PART
+    if same or not LEAST_PART < ratio < 1.0 / LEAST_PART or abs(mean) > COMPARED_MOST_MPS:
+        ratio = 1.0
+    return Compared(ratio, lasted_s), _combined(factor, ratio), not same
+
+
+@kernel
+def _unsure(compared: Compared) -> bool:
+    """Whether sensor and wheels have differed by a factor from the start on."""
+    return compared.lasted_s >= COMPARED_S and compared.ratio != 1.0
+
+
+@kernel
+def _lower_part(shown: float, reference: float, trusted: bool, compared: Compared) -> float:
+    """The lower of two speeds, as part of the one used, where nothing tells which of them is wrong; else 1."""
+    part = 1.0
+    if _unsure(compared):
+        part = min(1.0 / compared.ratio, 1.0)
+    if not (trusted or math.isnan(shown)) and abs(reference) > SLOW_MPS:
+        ratio = shown / reference
+        if LEAST_PART < ratio < 1.0:
+            part = min(part, ratio)
+    return part
 
 
 @kernel
@@ -736,6 +816,11 @@ def _doubted(trusted: bool, doubt_s: Wheels, factor: float) -> int:
 def _rims(w: Wheels, vehicle: VehicleParams) -> Wheels:
     front, rear = vehicle.front.wheel.radius_m, vehicle.rear.wheel.radius_m
     return (w[0] * front, w[1] * front, w[2] * rear, w[3] * rear)
+
+
+@kernel
+def _mean(values: Wheels) -> float:
+    return 0.25 * (values[0] + values[1] + values[2] + values[3])
 
 
 @kernel

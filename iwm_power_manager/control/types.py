@@ -183,6 +183,19 @@ class Agreed(NamedTuple):
     felt_mps: float
 
 
+class Compared(NamedTuple):
+    """The speed sensor beside wheels that roll freely for the first time.
+
+    Attributes
+    ----------
+    ratio : its speed over theirs, on average; 1 for good where they are the same, or too far apart to be one factor
+    lasted_s : for how long they have been compared
+    """
+
+    ratio: float
+    lasted_s: float
+
+
 class MotionState(NamedTuple):
     """What `control.motion` remembers from step to step.
 
@@ -199,6 +212,7 @@ class MotionState(NamedTuple):
     brake_gain : part of a friction torque that each brake gives, as found
     wheels_factor : what all four wheel speeds are multiplied by, since they are wrong by its inverse
     calm_s : for how long the wheels have done what torques and road say
+    compared : whether sensor and wheels have differed by a factor from the start on
     """
 
     speed_mps: float
@@ -214,6 +228,7 @@ class MotionState(NamedTuple):
     brake_gain: Wheels
     wheels_factor: float
     calm_s: float
+    compared: Compared
 
 
 class WheelGrip(NamedTuple):
@@ -329,6 +344,7 @@ def initial_state() -> ControllerState:
             brake_gain=(1.0, 1.0, 1.0, 1.0),
             wheels_factor=1.0,
             calm_s=0.0,
+            compared=Compared(ratio=1.0, lasted_s=0.0),
         ),
         travel=1.0,
         hold_nm=0.0,

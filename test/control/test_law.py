@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from iwm_power_manager.control import law
 from iwm_power_manager.control import types as t
 from iwm_power_manager.control.budget import Used, buckets, burst
+from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.persistence import no_jitter
 from iwm_power_manager.control.settings import (
     GATE_MODE_LIMITER,
@@ -752,6 +753,15 @@ def test_a_speed_below_zero_is_standstill():
     below, at = (drive(m._replace(speed_mps=v), initial_state(), DEFAULT, CAR, TABLE) for v in (-0.5, 0.0))
     assert below[0]._replace(speed_mps=0.0) == at[0]
     assert below[1] == at[1]
+
+
+@pytest.mark.parametrize("stuck_nm", [-40.0, 40.0])
+def test_a_stuck_motor_of_a_gated_wheel_is_not_held_against_by_its_brake(stuck_nm):
+    m = measurement(slips=(0.0, -0.4), demand=-20e3, motor_gain=(1.0, 1.0, 0.0, 1.0))
+    command = take(m._replace(motor_stuck_nm=(0.0, 0.0, stuck_nm, 0.0))).command
+    assert command.gated_wheels & 4
+    assert command.friction_torque_nm[2] == 0.0
+    assert violated_bound(command, CAR) == ""
 
 
 def test_hard_braking_is_shared_by_motors_and_friction_brakes():

@@ -172,7 +172,7 @@ def test_where_nothing_tells_sensor_from_wheels_the_lower_speed_weakens_no_brake
     car = Car(20.0)
     for _ in range(40):
         motion = car.step(0.0, lambda v: 0.8 * v)
-    assert motion.doubted == DOUBT_SPEED
+    assert motion.doubted == DOUBT_SPEED  # at this speed it may be off by 5 m/s
     assert motion.lower_part == pytest.approx(0.8, abs=0.01)
     assert all(car.step(0.0, lambda v: 0.5 * v).lower_part == 1.0 for _ in range(3))
 
@@ -225,6 +225,76 @@ def test_all_wheels_that_jump_by_one_factor_at_low_speed_are_corrected_until_the
         assert motion.wheel_speed_radps == pytest.approx((v / RADIUS,) * 4, rel=0.02)
         assert motion.doubted == (15 if wrong != 1.0 else 0)
         assert motion.lower_part == 1.0
+
+
+@pytest.mark.parametrize("factor", [0.76, 0.93, 1.07, 1.24])
+@pytest.mark.parametrize("wrong", ["wheels", "speed"])
+def test_where_sensor_and_wheels_differ_by_a_factor_from_the_start_on_slip_is_slip_and_the_lower_divides(factor, wrong):
+    spoilt = {
+        "wheels": {"spoil_wheels": lambda w: [factor * x for x in w]},
+        "speed": {"spoil_speed": lambda v: v / factor},
+    }[wrong]
+    car = Car(9.0)
+    for _ in range(40):
+        motion = car.step(0.0, **spoilt)
+    for torque, slip in ((-100.0, 0.0), (-250.0, 0.1)):
+        for k in range(20):
+            v, held = car.v, slip * min(k, 10) / 10.0
+            motion = car.step(torque, wheels=lambda v, held=held: [(1.0 - held) * v / RADIUS] * 4, **spoilt)
+        shown = v if wrong == "wheels" else v / factor
+        assert motion.speed_mps == pytest.approx(shown)
+        assert [RADIUS * x / motion.speed_mps for x in motion.wheel_speed_radps] == pytest.approx(
+            [1.0 - slip] * 4, abs=0.01
+        )
+        assert motion.lower_part * motion.speed_mps == pytest.approx(min(shown, shown * factor), rel=0.01)
+        assert motion.doubted == 15
+
+
+@pytest.mark.parametrize("wrong", ["wheels", "speed"])
+def test_what_was_wrong_by_a_factor_from_the_start_on_and_is_right_again_is_believed(wrong):
+    car = Car(9.0)
+    for k in range(100):
+        spoilt = {}
+        if k < 40:
+            spoilt = {
+                "wheels": {"spoil_wheels": lambda w: [0.8 * x for x in w]},
+                "speed": {"spoil_speed": lambda v: 1.2 * v},
+            }[wrong]
+        v = car.v
+        motion = car.step(0.0, **spoilt)
+    assert motion.doubted == 0
+    assert (motion.speed_mps, motion.lower_part) == (v, 1.0)
+
+
+def test_a_sensor_that_is_off_by_no_factor_from_the_start_on_is_found_when_the_wheels_roll():
+    car = Car(20.0)
+    for torque in (0.0,) * 50 + (-200.0,) * 150 + (0.0,) * 50:
+        v = car.v
+        motion = car.step(torque, lambda v: v + 5.0)
+    assert motion.doubted == DOUBT_SPEED
+    assert motion.speed_mps == pytest.approx(v, abs=0.7)
+
+
+@pytest.mark.parametrize("factor", [0.6, 0.97, 1.03, 1.6])
+def test_sensor_and_wheels_that_are_nearly_the_same_or_far_apart_are_no_factor_apart(factor):
+    car = Car(20.0)
+    for _ in range(100):
+        v = car.v
+        motion = car.step(0.0, lambda v: factor * v)
+    near = abs(factor - 1.0) < 0.1
+    assert motion.doubted == (0 if near else DOUBT_SPEED)
+    assert motion.speed_mps == pytest.approx(factor * v if near else v, rel=0.01)
+    assert motion.wheel_speed_radps == (v / RADIUS,) * 4
+
+
+@pytest.mark.parametrize("factor", [1.3, 1.7, 2.0])
+def test_pulling_away_with_a_sensor_that_is_far_too_high_the_wheels_are_believed(factor):
+    car = Car(0.0)
+    for torque in (150.0,) * 300 + (-60.0,) * 50:
+        v = car.v
+        motion = car.step(torque, lambda v: factor * v)
+    assert motion.lower_part * motion.speed_mps == pytest.approx(v, rel=0.05)
+    assert [RADIUS * x / motion.speed_mps for x in motion.wheel_speed_radps] == pytest.approx([1.0] * 4, abs=0.05)
 
 
 def test_wheels_that_come_late_have_not_jumped():

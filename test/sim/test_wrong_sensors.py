@@ -44,8 +44,8 @@ ONE_WHEEL = st.one_of(
 
 @st.composite
 def faults(draw):
-    """A fault of one sensor, or of what scales all wheels, from before the braking or in the midst of it."""
-    at_s = draw(st.sampled_from((0.3, 1.5)))
+    """A fault of one sensor, or of what scales all wheels: from the start on, before the braking or in its midst."""
+    at_s = draw(st.sampled_from((0.0, 0.3, 1.5)))
     which = draw(st.sampled_from(("speed", "wheel", "wheels")))
     if which == "speed":
         return (wrong("vehicle_speed", *draw(SPEEDS), at_s),)
