@@ -25,8 +25,9 @@ def one_line(text: str, limit: int = MAX_MESSAGE) -> str:
 
 
 def spelled_like(given: str, known: Iterable[str]) -> list[str]:
-    """Up to three of the known names that `given` may be a slip of, the likest first."""
-    return difflib.get_close_matches(given, list(known), 3, _NEAR)
+    """Up to three of the known names that `given` may be a slip of, capitals or not, the likest first."""
+    names = {name.lower(): name for name in known}
+    return [names[near] for near in difflib.get_close_matches(given.lower(), list(names), 3, _NEAR)]
 
 
 def did_you_mean(names: Iterable[str]) -> str:

@@ -47,7 +47,8 @@ def test_a_path_that_is_nowhere_comes_back_as_given(path: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "meant"), [("nyc", "nycc"), ("jalalmab_2015", "jalalmaab_2015"), ("my_car.yml", "my_car.yaml")]
+    ("given", "meant"),
+    [("nyc", "nycc"), ("NYCC", "nycc"), ("jalalmab_2015", "jalalmaab_2015"), ("my_car.yml", "my_car.yaml")],
 )
 def test_a_name_that_is_spelled_wrong_is_answered_with_what_was_meant(
     given: str, meant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -74,7 +74,8 @@ def run_scenario(plan: Plan) -> int:
 
 def _make_output(plan: Plan) -> None:
     try:
-        (plan.output / "log").mkdir(parents=True)
+        plan.output.mkdir(parents=True)
+        (plan.output / "log").mkdir()
     except OSError as error:
         raise ConfigError(
             plan.output, "", f"cannot be created: {error.strerror}", "a folder that is not there yet"

@@ -56,11 +56,12 @@ def test_without_arguments_it_drives_nycc_with_the_shipped_policy_in_lockstep():
         (["--vehicle", "/nowhere.yaml", "--strategy", "equal"], "demo: /nowhere.yaml: cannot be read"),
         (["--policy", "/nowhere.npz"], "demo: /nowhere.npz: cannot be read"),
         (["--policy", ""], "demo: policy_file: is empty"),
+        (["--strategy", "equal", "--output", "."], "demo: .: cannot be created: File exists"),
     ],
 )
 def test_a_bad_file_gives_one_line_before_anything_starts(tmp_path, monkeypatch, capsys, arguments, expected):
     monkeypatch.setattr(signal, "signal", lambda *_: None)
-    assert demo.main([*arguments, "--output", str(tmp_path / "run")]) == 2
+    assert demo.main(["--output", str(tmp_path / "run"), *arguments]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(expected)
     assert not (tmp_path / "run").exists()
