@@ -145,7 +145,9 @@ class BagReader:
         names = self._names[source] = {number: self._name(topic) for number, topic in source.topics().items()}
         for number, topic in source.topics().items():
             self.counts[names[number]] += source.counts[number]
-            if self.topics.setdefault(names[number], topic).name != names[number]:
+            if topic.definition or names[number] not in self.topics:
+                self.topics[names[number]] = topic
+            if names[number] != topic.name:
                 source.note(f"{topic.name} has more than one definition: each message is read by its own")
         self.custom_data = source.custom_data | self.custom_data
 
@@ -155,6 +157,7 @@ class BagReader:
         if kinds and not topic.definition:
             return topic.name
         name = f"{topic.name} ({len(kinds) + 1})" if kinds else topic.name
+        name = kinds.pop((topic.type, ""), name)  # an older file of the bag may have no definitions
         return kinds.setdefault((topic.type, topic.definition), name)
 
     def _open_all(self) -> None:
@@ -221,11 +224,19 @@ def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside
     """
     regular_file(path, folder)
     named = path.suffix == COMPRESSED_SUFFIX
+    if journals(path):
+        return path, "has a journal, which is not read: recorder --recover does that"
     if not named and _head(path, len(ZSTD_MAGIC)) != ZSTD_MAGIC:
         return path, ""
     where = path.parent if beside else None
     copied = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_bag_", dir=where))) / path.stem
     return copied, decompress_file(path, copied) or ("" if named else "is compressed, which its name does not say")
+
+
+def journals(path: Path) -> list[Path]:
+    """What sqlite has left beside a database that was not closed."""
+    beside = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
+    return [journal for journal in beside if journal.is_file() and journal.stat().st_size]
 
 
 def _head(path: Path, size: int) -> bytes:
@@ -256,6 +267,8 @@ def data_files(folder: Path) -> list[Path]:
     except OSError as error:
         raise BagError(f"{folder}: cannot be read: {error.strerror or error}") from None
     names = [entry for entry in entries if entry.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES)]
+    real = {os.path.realpath(name) for name in names if not name.is_symlink()}
+    names = [name for name in names if not (name.is_symlink() and os.path.realpath(name) in real)]  # the same twice
     return sorted(names, key=_recording_order)
 
 

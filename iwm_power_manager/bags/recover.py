@@ -10,6 +10,7 @@ what a power cut has left of a part may be zeros that look like messages.
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 import sqlite3
@@ -31,6 +32,8 @@ from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.files import sync_folder
+
+_DAMAGED = ".damaged"
 
 
 class FileRecovery(NamedTuple):
@@ -124,6 +127,7 @@ def recover(path: Path | str) -> Recovery:
         for name in names:
             try:
                 regular_file(name, folder)
+                _check_name(name)
                 files.append(_File(name, stack, gaps))
             except BagError as error:
                 left_out.append(FileRecovery(name.name, False, 0, str(error)))
@@ -162,6 +166,13 @@ def _names(path: Path) -> list[Path]:
     if not names:
         raise BagError(f"{path}: holds no .mcap or .db3 file")
     return names
+
+
+def _check_name(path: Path) -> None:
+    try:
+        path.name.encode()
+    except UnicodeEncodeError:
+        raise BagError(f"{path}: its name is no UTF-8 text, which metadata.yaml could not hold: rename it") from None
 
 
 class _Gaps:
@@ -224,7 +235,7 @@ class _File:
             raise BagError(
                 f"{temporary}: holds {made.count} of {self.seen.count} messages; the original is left as it is"
             )
-        kept = self.path.name if target != self.path else f"{target.name}.damaged" if copy.lost or copy.torn else ""
+        kept = self.path.name if target != self.path else _free_name(target) if copy.lost or copy.torn else ""
         what = self.problem or ("is compressed" if self.is_compressed else "is sqlite3 beside MCAP")
         self.report = FileRecovery(target.name, True, made.count, what, copy.torn, copy.lost, kept)
         self.seen, self.path, self._temporary = made, target, temporary
@@ -234,9 +245,8 @@ class _File:
         if self._temporary is None:
             return
         try:
-            if self.report.kept.endswith(".damaged"):
+            if _DAMAGED in self.report.kept:
                 keep = self.path.with_name(self.report.kept)
-                keep.unlink(missing_ok=True)
                 try:
                     os.link(self.path, keep)
                 except OSError:  # a file system without links
@@ -247,18 +257,24 @@ class _File:
             raise BagError(f"{self._temporary}: cannot be written: {error.strerror or error}") from None
 
 
+def _free_name(path: Path) -> str:
+    """Name for an original that is kept; that of an earlier recovery stays."""
+    names = (f"{path.name}{_DAMAGED}{f'_{i}' if i else ''}" for i in itertools.count())
+    return next(name for name in names if not os.path.lexists(path.with_name(name)))
+
+
 def _is_own(source: reader.Source) -> bool:
     return source.header.library.startswith(LIBRARY.partition(" ")[0])
 
 
 def _opened(path: Path, stack: ExitStack) -> tuple[Path, str]:
     """The file itself, or a copy that can be read, and what is wrong with it."""
-    journals = [journal for end in ("-wal", "-journal") if (journal := path.with_name(path.name + end)).is_file()]
+    journals = reader.journals(path)
     if not journals:
         return reader.opened_file(path, stack, beside=True)
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_recover_", dir=path.parent)))
     for file in (path, *journals):
-        regular_file(file)
+        regular_file(file, path.parent)
         shutil.copyfile(file, folder / file.name)
     with suppress(sqlite3.Error), closing(sqlite3.connect(folder / path.name)) as database:  # else it is read without
         database.execute("PRAGMA journal_mode = DELETE")

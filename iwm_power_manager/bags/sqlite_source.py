@@ -49,6 +49,7 @@ class SqliteSource:
         self.header = Header(profile="ros2", library="")
         self.custom_data: dict[str, str] = {}  # there is none in these files
         self._topics: dict[int, Topic] = {}
+        self._plain = True  # the data is bytes in each row: rosbags fails at others
         self._steps = (
             limits.SQLITE_INSTRUCTIONS + limits.SQLITE_INSTRUCTIONS_PER_BYTE * limits.regular_file(path)
         ) // _STEP
@@ -72,7 +73,7 @@ class SqliteSource:
         except KeyError as error:
             raise BagError(f"{path}: is no rosbag2 sqlite3 bag: its topics have no {error}") from None
         self._count()
-        self._reader = None if self.damage else self._rosbags_reader(stack)
+        self._reader = self._rosbags_reader(stack) if self._plain and not self.damage else None
 
     def topics(self) -> dict[int, Topic]:
         """The topic of each id."""
@@ -151,10 +152,11 @@ class SqliteSource:
             (problem,) = self._database.execute("PRAGMA quick_check(1)").fetchone()
             if problem != "ok":
                 self.note(f"is damaged: {' '.join(problem.split())}")
-            for number, count, start_ns, end_ns in self._database.execute(
-                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages"
+            for number, count, start_ns, end_ns, odd in self._database.execute(
+                "SELECT topic_id, count(*), min(timestamp), max(timestamp), total(typeof(data) <> 'blob') FROM messages"
                 " WHERE typeof(timestamp) = 'integer' GROUP BY topic_id"
             ):
+                self._plain = self._plain and not odd
                 self.start_ns = min(self.start_ns, start_ns) if self.counts else start_ns
                 self.end_ns = max(self.end_ns, end_ns)
                 self.counts[number] = count

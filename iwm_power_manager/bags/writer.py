@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import os
+import stat
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
@@ -316,9 +317,12 @@ def announce(file: McapFile, topic: metadata.Topic) -> int:
 
 def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
     """Write a bag's `metadata.yaml`; `WriteFailed` if it cannot be. What it says is of `metadata.bag_information`."""
+    path = folder / metadata.METADATA_FILE
     try:
-        atomic_write(
-            folder / metadata.METADATA_FILE, metadata.yaml_text({"rosbag2_bagfile_information": information}).encode()
-        )
+        if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):  # what a link leads to is not the bag's
+            path.unlink()
+        atomic_write(path, metadata.yaml_text({"rosbag2_bagfile_information": information}).encode())
     except ConfigError as error:
         raise WriteFailed(str(error)) from None
+    except OSError as error:
+        raise WriteFailed(f"{path}: cannot be written: {error.strerror or error}") from None

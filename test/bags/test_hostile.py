@@ -122,6 +122,56 @@ def test_the_paths_in_a_bag_stay_in_it_and_are_regular_files(tmp_path: Path, nam
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("damaged", [False, True])
+def test_recovery_writes_nothing_outside_of_the_bag(tmp_path: Path, damaged: bool) -> None:
+    outside = tmp_path / "outside"
+    outside.write_text("kept")
+    folder = foreign.write_bag(tmp_path / "bag", foreign.drive(5))
+    if damaged:
+        os.truncate(folder / "a_0.mcap", 2000)
+    for name in ("metadata.yaml", "a_0.mcap.recovering", "a_0.mcap.damaged"):
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to(outside)
+    assert recover(folder).metadata_written
+    assert outside.read_text() == "kept"
+    assert not (folder / "metadata.yaml").is_symlink()
+
+
+def test_a_pipe_in_the_place_of_the_metadata_holds_nothing_up(tmp_path: Path) -> None:
+    folder = foreign.write_bag(tmp_path / "bag", foreign.drive(5))
+    (folder / "metadata.yaml").unlink()
+    os.mkfifo(folder / "metadata.yaml")
+    assert contents(folder)[0] == 15
+    assert recover(folder).metadata_written
+    assert contents(folder) == (15, [])
+
+
+def test_a_file_whose_name_is_no_text_is_left_out_with_one_line(tmp_path: Path) -> None:
+    folder = foreign.write_bag(tmp_path / "bag", foreign.drive(5))
+    os.rename(os.fsencode(folder / "a_0.mcap"), os.fsencode(folder) + b"/\xff.mcap")
+    assert contents(folder)[0] == 15
+    with pytest.raises(BagError, match=r"\\udcff\.mcap: its name is no UTF-8 text"):
+        recover(folder)
+
+
+def test_rows_of_text_where_bytes_should_be_are_counted(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(10))
+    with sqlite3.connect(folder / "a_0.db3") as database:
+        database.execute("UPDATE messages SET data = CAST(x'ff00f1' AS TEXT) WHERE id = 5")
+    database.close()
+    count, damage = contents(folder)
+    assert (count, damage) == (29, [f"{folder / 'a_0.db3'}: 1 row(s) hold no message of a known topic"])
+    assert recover(folder).files[0].message_count == 29
+
+
+def test_a_link_to_another_file_of_the_bag_is_not_the_same_messages_once_more(tmp_path: Path) -> None:
+    folder = foreign.write_bag(tmp_path / "bag", foreign.drive(5))
+    (folder / "a_1.mcap").symlink_to("a_0.mcap")
+    assert [file.message_count for file in recover(folder).files] == [15]
+    (folder / "metadata.yaml").unlink()
+    assert contents(folder)[0] == 15
+
+
 @pytest.mark.parametrize("kind", ["device", "fifo", "folder"])
 def test_a_single_path_has_to_be_a_regular_file(tmp_path: Path, kind: str) -> None:
     path = Path("/dev/zero") if kind == "device" else tmp_path / "a.mcap"

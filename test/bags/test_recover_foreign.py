@@ -296,6 +296,34 @@ def test_a_channel_that_is_announced_anew_as_another_is_said_and_becomes_another
         assert (reader.counts["/demand"], reader.counts["/other"]) == (10, 10)
 
 
+def test_a_second_recovery_keeps_the_original_of_the_first(tmp_path: Path) -> None:
+    path = foreign.write_mcap(tmp_path / "bag" / "a_0.mcap", entries(), CHANNELS, chunk_bytes=2000)
+    originals = []
+    for _ in range(2):
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2 :] = bytes(100)
+        path.write_bytes(content)
+        originals.append(bytes(content))
+        recover(path.parent)
+    assert [(path.parent / f"a_0.mcap.damaged{end}").read_bytes() for end in ("", "_1")] == originals
+
+
+def test_a_database_with_a_journal_says_that_it_is_not_read(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(5))
+    (folder / "a_0.db3-wal").write_bytes(b"x" * 4096)
+    with BagReader(folder) as reader:
+        assert any("has a journal, which is not read: recorder --recover" in line for line in reader.damage)
+
+
+def test_a_topic_without_a_definition_in_an_older_file_is_read_by_that_of_the_next(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(10)[:15])
+    foreign.write_mcap(folder / "a_1.mcap", foreign.drive(10)[15:])
+    foreign.write_metadata(folder, relative_file_paths=["a_0.db3", "a_1.mcap"])
+    with BagReader(folder) as reader:
+        assert set(reader.topics) == {"/car/speed", "/demand", "/joint_states"}
+        assert reader.topics["/car/speed"].definition == foreign.SPEED.text
+
+
 def test_a_file_whose_first_block_was_never_written_is_recovered_from_its_first_chunk_on(tmp_path: Path) -> None:
     found = foreign.drive(20)
     chunks = [foreign.announced() + foreign.message_records(found[i : i + 15]) for i in range(0, 60, 15)]
