@@ -593,25 +593,21 @@ def rolling_torque_nm(axle):
     return 0.08 * load_n * getattr(CAR, axle).wheel.radius_m
 
 
-def with_torque(state, axle, torque_nm):
-    """The state after this torque at both wheels of an axle."""
-    torques = (torque_nm, torque_nm, 0.0, 0.0) if axle == "front" else (0.0, 0.0, torque_nm, torque_nm)
-    wheels = tuple(wheel._replace(total_nm=torque) for wheel, torque in zip(state.wheels, torques, strict=True))
-    return state._replace(wheels=wheels)
-
-
-@AXLES
+@WHEELS
 @pytest.mark.parametrize(("part", "right"), [(0.96, True), (1.04, False)])
-def test_five_speeds_that_agree_are_right_at_once_where_each_axle_s_torque_is_small_for_its_own_load(axle, part, right):
+def test_five_speeds_that_agree_are_right_at_once_where_each_torque_is_small_for_the_wheel_s_own_load(
+    wheel, part, right
+):
     """More torque than a rolling wheel takes might be slip, which is waited for."""
     state = remembered(12.0, speed_radps=rolling(20.0))
     state = state._replace(
         motion=state.motion._replace(speed_mps=12.0, shown_mps=20.0, wheel_doubt_s=(0.5,) * 4, doubt_s=0.5)
     )
+    torques = one(wheel, part * rolling_torque_nm("front" if wheel < 2 else "rear"), (0.0,) * 4)
     for k in range(60):
         speed = 20.0 + 0.001 * k
-        state = with_torque(state, axle, part * rolling_torque_nm(axle))
-        command, state = step(measured(0.0, rolling(speed), speed=speed), state, OFF)
+        wheels = tuple(w._replace(total_nm=torque) for w, torque in zip(state.wheels, torques, strict=True))
+        command, state = step(measured(0.0, rolling(speed), speed=speed), state._replace(wheels=wheels), OFF)
     assert (command.doubted == 0) == right
 
 
