@@ -72,8 +72,6 @@ def _rolled(
 ) -> WheelGrip:
     """A point added to a wheel's regression, with the weight of all before it times `keep` (weighted Welford)."""
     total = keep * grip.weight + weight
-    if total <= 0.0:
-        return WheelGrip(slip, used, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     part = weight / total
     d_torque, d_curve = torque - grip.torque, curve - grip.curve
     mean_torque = grip.torque + part * d_torque

@@ -394,6 +394,12 @@ class TestRecord:
             from_numbers(list((drive.run(1) | {"setting.strategy": 99.0}).values()))
 
 
+def test_until_something_is_commanded_every_brake_counts_in_full(drive) -> None:
+    assert drive.controller.brake_gain == (1.0,) * 4
+    drive.run(1)
+    assert drive.controller.brake_gain == drive.controller.state.motion.brake_gain
+
+
 class TestFaultOfTheLaw:
     @pytest.mark.parametrize("torque", [math.nan, 1e6])
     def test_what_no_motor_may_be_given_never_leaves(self, drive, monkeypatch, torque) -> None:

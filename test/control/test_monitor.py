@@ -532,3 +532,23 @@ class TestWhatIsRefusedSaysWhy:
     def test_wheels_by_which_are_lost_and_how_those_that_came_are_called(self, monitor, values, names, words) -> None:
         monitor.take_wheels(wheels(NOW, values, names), NOW)
         assert monitor.tallies[WHEELS].why() == words
+
+
+class TestApart:
+    @pytest.mark.parametrize(
+        ("speed", "rims", "words"),
+        [
+            (10.0, (20.0, 20.0, 20.0, 20.0), ""),
+            (10.0, (19.0, 20.0, 21.0, 20.0), ""),
+            (0.1, (3.0, 3.0, 3.0, 3.0), ""),
+            (36.0, (20.0, 20.0, 20.0, 20.0), "speed is 3.6 times what wheel_speed"),
+            (10.0, (0.0, 0.0, 0.0, 0.0), "speed is inf times what wheel_speed"),
+        ],
+    )
+    def test_speed_and_wheels_that_contradict_each_other_in_motion(
+        self, monitor, speed, rims, words
+    ) -> None:
+        assert monitor.take_speed(SpeedReading(NOW, speed), NOW)
+        assert monitor.take_wheels(wheels(NOW, rims), NOW)
+        assert words in monitor.apart
+        assert bool(words) == bool(monitor.apart)

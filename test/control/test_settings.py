@@ -58,3 +58,10 @@ def test_of_two_that_depend_on_each_other_the_first_is_at_most_the_second(small,
     problem = settings.check_together(values | {small: 2.0 * values[large]})
     assert problem.startswith(f"{small}: ")
     assert f"at most {large} = " in problem
+
+
+def test_settings_are_shown_as_they_are_given():
+    given = DEFAULTS._replace(gate_mode=settings.GATE_MODE_TABLE2, gate_driving=False, critical_slip=0.25)
+    there = settings.as_shown(given)
+    assert (there["gate_mode"], there["gate_driving"], there["critical_slip"]) == ("table2", False, 0.25)
+    assert DEFAULTS._replace(**settings.from_shown(there)) == given

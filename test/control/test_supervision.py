@@ -23,10 +23,12 @@ from iwm_power_manager.control.supervision import (
     STALE_WHEELS,
     Supervision,
     SupervisionLimits,
+    binding_limits,
     shape_demand,
     stale_inputs,
     supervise,
 )
+from iwm_power_manager.control.types import LIMIT_BATTERY_CHARGE, LIMIT_BATTERY_DISCHARGE, LIMIT_NAMES, LIMIT_SLIP
 
 # Powers of two, so that sums of steps are exact.
 LIMITS = SupervisionLimits(fade_s=0.5, brake_release_s=2.0, recover_s=0.25, resume_s=1.0)
@@ -190,3 +192,13 @@ class TestShapeDemand:
     def test_the_shaped_demand_lies_between_zero_and_the_demand(self, demand, then, now, stale, motor, brake) -> None:
         shaped = shape_demand(demand, then, now, Supervision(MODE_DEGRADED, stale, motor, brake, 0.0))
         assert min(demand, 0.0) <= shaped <= max(demand, 0.0)
+
+
+@pytest.mark.parametrize("battery", [LIMIT_BATTERY_CHARGE, LIMIT_BATTERY_DISCHARGE])
+def test_motors_that_are_faded_out_are_not_put_down_to_the_battery(battery: int) -> None:
+    assert binding_limits(0, 0.0) == binding_limits(0, 1.0) == []
+    assert binding_limits(battery | LIMIT_SLIP, 0.5) == [
+        name for bit, name in LIMIT_NAMES.items() if bit in (battery, LIMIT_SLIP)
+    ]
+    assert binding_limits(battery | LIMIT_SLIP, 0.0) == [LIMIT_NAMES[LIMIT_SLIP], "motors faded out"]
+    assert binding_limits(LIMIT_SLIP, 0.0) == [LIMIT_NAMES[LIMIT_SLIP]]
