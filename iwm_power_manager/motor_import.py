@@ -97,11 +97,7 @@ def read_points(
         allowed = f"{error.allowed}; {listed}" if error.allowed else listed
         raise ConfigError(path, error.key, problem, allowed) from None
     if percent is None and quantity == "efficiency":
-        values = [value for _, _, _, value in cells if value > 0.0]
-        percent = 2 * sum(value > 1.5 for value in values) > len(values)
-        said += ["efficiencies in percent: most are above 1.5"] if percent else []
-        if not percent and any("%" in cell for cell in header):
-            doubts.append("efficiencies as fractions of 1, although the header says %: few are above 1.5")
+        percent = _in_percent(cells, header, said, doubts)
     points: dict[tuple[float, float], float] = {}
     scale = RAD_S_PER_RPM if speed_unit == "rpm" else 1.0
     for line, speed, torque, value in cells:
@@ -120,6 +116,17 @@ def read_points(
     if len(points) < _SPARSE * grid:
         doubts.append(f"its points hardly lie on a grid: {len(points)} of {grid}")
     return Points(points, said, doubts)
+
+
+def _in_percent(
+    cells: list[tuple[int, float, float, float]], header: list[str], said: list[str], doubts: list[str]
+) -> bool:
+    values = [value for _, _, _, value in cells if value > 0.0]
+    percent = 2 * sum(value > 1.5 for value in values) > len(values)
+    said += ["efficiencies in percent: most are above 1.5"] if percent else []
+    if not percent and any("%" in cell for cell in header):
+        doubts.append("efficiencies as fractions of 1, although the header says %: few are above 1.5")
+    return percent
 
 
 def _trimmed(table: Table) -> Table:
