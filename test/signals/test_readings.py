@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from geometry_msgs.msg import TwistStamped
+from geometry_msgs.msg import Twist, TwistStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import BatteryState, JointState
-from std_msgs.msg import Float64, Int16, Int16MultiArray
+from sensor_msgs.msg import BatteryState, JointState, MultiDOFJointState
+from std_msgs.msg import Float32MultiArray, Float64, Int16, Int16MultiArray
 
 from iwm_power_manager.control.inputs import Violation, check_names
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
@@ -183,6 +183,26 @@ def test_speed_from_any_numeric_field_in_its_unit(tmp_path: Path, msgtype: str, 
         (found,) = quick(serialize_message(sent), 77)
         assert isinstance(found, SpeedReading)
         assert found == (0 if quick.stamped else 77, pytest.approx(5.0))
+
+
+def test_wheels_of_one_message_may_stand_in_any_order_and_in_lists_of_messages(tmp_path: Path) -> None:
+    """docs/connect.md: an index for each wheel, four sources of the same topic."""
+
+    def wheels(fields: list[str], msgtype: str) -> str:
+        each = [f"{{topic: w, type: {msgtype}, field: '{field}', unit: rad/s}}" for field in fields]
+        return f"  wheel_speed: [{', '.join(each)}]"
+
+    swapped = wheels([f"data[{i}]" for i in (1, 0, 3, 2)], "std_msgs/msg/Float32MultiArray")
+    twists = MultiDOFJointState(twist=[Twist() for _ in range(4)])
+    for twist, speed in zip(twists.twist, (2.0, 1.0, 4.0, 3.0), strict=True):
+        twist.angular.y = speed
+    nested = wheels([f"twist[{i}].angular.y" for i in (1, 0, 3, 2)], "sensor_msgs/msg/MultiDOFJointState")
+    for text, sent in ((swapped, Float32MultiArray(data=[2.0, 1.0, 4.0, 3.0])), (nested, twists)):
+        quick = read_from(tmp_path, text)["w"]
+        for _ in range(2):
+            (found,) = quick(serialize_message(sent), 7)
+            assert isinstance(found, JointReading)
+            assert found.values == (1.0, 2.0, 3.0, 4.0)
 
 
 @pytest.mark.parametrize("sign", ["[-1, -1, -1, -1]", "[1, 1, 1, -1]", "-1"])
