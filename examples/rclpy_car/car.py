@@ -76,6 +76,8 @@ def main() -> int:
         force -= road_load_n(speed, 0.0, car.chassis) if speed > 0.0 else 0.0
         speed = max(speed + force / equivalent_mass_kg(car) * PERIOD_S, 0.0)
         braking = braking or speed > options.target
+    unheard = [node.resolve_topic_name(name) for name, (_, at) in forces_n.items() if at == 0.0]
+    print(f"nothing came on {', '.join(unheard)}: is the power manager in another namespace?\n" * bool(unheard), end="")
     print("stopped" if braking and speed == 0.0 else f"did not stop: {speed:.2f} m/s")
     return 0 if braking and speed == 0.0 else 1
 
