@@ -545,9 +545,7 @@ class TestApart:
             (10.0, (0.0, 0.0, 0.0, 0.0), "speed is inf times what wheel_speed"),
         ],
     )
-    def test_speed_and_wheels_that_contradict_each_other_in_motion(
-        self, monitor, speed, rims, words
-    ) -> None:
+    def test_speed_and_wheels_that_contradict_each_other_in_motion(self, monitor, speed, rims, words) -> None:
         assert monitor.take_speed(SpeedReading(NOW, speed), NOW)
         assert monitor.take_wheels(wheels(NOW, rims), NOW)
         assert words in monitor.apart
