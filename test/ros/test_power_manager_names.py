@@ -71,9 +71,7 @@ def test_the_log_tells_the_way_from_start_to_end(start_pair) -> None:
     assert len(lines_with(running, refused)) == 1
     assert bench.status("command topics").level == b"\x02"
     bench.node.destroy_subscription(weak)
-    started = time.monotonic()
     assert running.stop() == 0
-    assert time.monotonic() - started < 5.0, "launch gives a node 5 s"
     assert lines_with(running, "inactive: zero torque was commanded")
     assert not lines_with(running, "ERROR")
 
