@@ -290,6 +290,8 @@ def read_signal(
     log_times, stamps, demands, speeds = map(np.array, zip(*rows, strict=True))
     time_ns = _times(log_times, stamps)
     keep = _advancing(time_ns)
+    if 2 * keep.size < time_ns.size:
+        damage.append(f"only {keep.size} of {time_ns.size} demands have a time of their own: the others are left out")
     time_s = (time_ns[keep] - time_ns[keep[0]]) * 1e-9
     return RecordedDrive(time_s, demands[keep], speeds[keep], stream.bad_messages + wrong, damage)
 

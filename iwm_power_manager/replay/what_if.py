@@ -22,6 +22,7 @@ from iwm_power_manager.errors import BagError
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
+from iwm_power_manager.replay.compare import ReplayReport
 from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.run import Replay
 
@@ -91,8 +92,10 @@ class Consumption:
 
 def what_if(
     bag: BagReader, plans: Sequence[tuple[str, Plan]], progress: Callable[[int, int], None] | None = None
-) -> list[Consumption]:
+) -> tuple[list[Consumption], ReplayReport]:
     """Consumption of the recorded commands, where the bag has them, and of each plan, at the force of the first.
+
+    The report is that of the last plan: what it says of the bag is the same for all.
 
     Parameters
     ----------
@@ -122,12 +125,13 @@ def what_if(
                 motor_nm, brake_nm = step.command.motor_torque_nm, step.command.friction_torque_nm
                 wanted_n = forces_n.setdefault(step.stamp_ns, force_n(vehicle, measurement, motor_nm, brake_nm))
                 row.add(vehicle, measurement, at_force(vehicle, measurement, motor_nm, brake_nm, wanted_n), brake_nm)
-        if not replay.report().steps:
+        report = replay.report()
+        if not report.steps:
             raise BagError(f"{bag.path}: gave no control step: {replay.why_no_step()}")
         rows += [row] if recorded is None else [recorded, row]
     if rows[0].distance_m < _LEAST_DISTANCE_M or rows[0].chemical_wh == 0.0:
         raise BagError(f"{bag.path}: the car does not move ({rows[0].distance_m:.2f} m): there is nothing to compare")
-    return rows
+    return rows, report
 
 
 def force_n(vehicle: VehicleParams, measurement: Measurement, motor_nm: Wheels, brake_nm: Wheels) -> float:

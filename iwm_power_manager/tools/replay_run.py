@@ -102,7 +102,7 @@ def _what_if(bag: BagReader, options: argparse.Namespace) -> int:
     names = options.strategy or ["equal", name_of(_plan(bag, options, car, None).settings.strategy)]
     plans = [(name, _plan(bag, options, car, name)) for name in dict.fromkeys(names)]
     with _progress(bag, options, len(plans)) as progress:
-        rows = what_if(bag, plans, progress)
+        rows, report = what_if(bag, plans, progress)
     savings = [row.saving_percent(rows[0]) for row in rows]
     lines = [
         f"{bag.path}: open-loop estimate for {plans[0][1].vehicle.name}",
@@ -114,9 +114,9 @@ def _what_if(bag: BagReader, options: argparse.Namespace) -> int:
     lines.append("  settings as recorded, unless --set or --strategy says otherwise")
     if None in savings:
         lines.append("  no saving where the motors could not give that force: the work at the wheels is another")
-    lines += [f"  damaged: {line}" for line in bag.damage]
+    lines += _remarks(report)
     found = [{**asdict(row), "saving_percent": saving} for row, saving in zip(rows, savings, strict=True)]
-    _show(lines, {"bag": str(bag.path), "rows": found, "damage": bag.damage}, options)
+    _show(lines, {"bag": str(bag.path), "rows": found, "notes": report.notes, "damage": bag.damage}, options)
     return DONE
 
 
@@ -212,11 +212,15 @@ def _is_other_policy(bag: BagReader, plan: Plan) -> bool:
 def _report_lines(bag: BagReader, report: ReplayReport, elapsed_s: float) -> list[str]:
     span_s = report.span_ns * 1e-9
     how = "repeated from the recorded state" if report.exact else "made from the recorded inputs"
-    lines = [
+    first = (
         f"{bag.path}: {report.messages} messages, {report.steps} steps over {span_s:.2f} s, {how}, "
         f"in {elapsed_s:.2f} s ({report.messages / max(elapsed_s, 1e-9):.0f} messages/s)"
-    ]
-    lines += [f"  {note}" for note in report.notes]
+    )
+    return [first, *_remarks(report)]
+
+
+def _remarks(report: ReplayReport) -> list[str]:
+    lines = [f"  {note}" for note in report.notes]
     if report.gaps:
         lines.append(f"  {report.gaps} time(s) steps before are not in the bag: the law's memory there is unknown")
     if report.restarts:

@@ -113,6 +113,26 @@ def test_an_input_that_stays_away_is_said(tmp_path: Path, mapping: Path) -> None
     assert "vehicle_speed had not come for 0.5 s at 26 wheel speeds: taken as it was last" in report.notes
 
 
+def test_an_estimate_says_what_a_replay_says_of_the_bag(
+    tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entries = [
+        (t, n, data[:-8] + struct.pack("<d", 3.6 * 8.0) if n == 0 else data) for t, n, data in drive(stamp=lambda _: 0)
+    ]
+    bag = write_bag(tmp_path / "bag", entries)
+    arguments = [str(bag), "--mapping", str(mapping), "--strategy", "equal", "--what-if", "jalalmaab_2015"]
+    assert main(arguments) == DONE
+    said = capsys.readouterr().out
+    assert "do not advance: log times are used" in said
+    assert "times what wheel_speed and a radius of 0.33 m give" in said
+
+
+def test_demands_of_one_time_are_not_left_out_in_silence(tmp_path: Path, mapping: Path) -> None:
+    entries = [(foreign.START_NS, n, data) for _, n, data in drive(stamp=lambda _: 0)]
+    found = read_signal(write_bag(tmp_path / "bag", entries), load_mapping(mapping))
+    assert f"only 1 of {COUNT} demands have a time of their own: the others are left out" in found.damage
+
+
 def test_a_speed_against_the_wheels_is_said(tmp_path: Path, mapping: Path) -> None:
     entries = [(t, n, data[:-8] + struct.pack("<d", -8.0) if n == 0 else data) for t, n, data in drive()]
     report, _ = replayed(write_bag(tmp_path / "bag", entries), mapping)
