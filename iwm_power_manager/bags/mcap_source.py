@@ -429,7 +429,8 @@ class McapSource:
         if record.start >= self._too_much_at:
             raise BagError(f"is left out: those before it hold {limits.MAX_RATIO} times what the file has")
         chunk: Chunk = _read(Chunk, self.data, record)
-        raw = limits.decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
+        size = chunk.uncompressed_size if chunk.compression else len(chunk.data)
+        raw = limits.decompress(chunk.compression, chunk.data, size)
         if chunk.uncompressed_crc and zlib.crc32(raw) != chunk.uncompressed_crc:
             raise BagError("is damaged: its checksum is wrong")
         return raw

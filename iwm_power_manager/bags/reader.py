@@ -236,7 +236,7 @@ def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside
 def journals(path: Path) -> list[Path]:
     """What sqlite has left beside a database that was not closed."""
     beside = [path.with_name(path.name + end) for end in ("-wal", "-journal")]
-    return [journal for journal in beside if journal.is_file() and journal.stat().st_size]
+    return [journal for journal in beside if os.path.isfile(journal) and os.path.getsize(journal)]
 
 
 def _head(path: Path, size: int) -> bytes:

@@ -154,6 +154,15 @@ def test_a_file_whose_name_is_no_text_is_left_out_with_one_line(tmp_path: Path) 
         recover(folder)
 
 
+def test_a_name_that_is_as_long_as_names_may_be_is_read(tmp_path: Path) -> None:
+    path = foreign.write_mcap(tmp_path / ("x" * 250 + ".mcap"), foreign.drive(5))
+    assert contents(path) == (15, [])
+    assert recover(path).files[0].message_count == 15
+    os.truncate(path, 2000)
+    with pytest.raises(BagError, match="cannot be written: File name too long"):
+        recover(path)
+
+
 def test_rows_of_text_where_bytes_should_be_are_counted(tmp_path: Path) -> None:
     folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(10))
     with sqlite3.connect(folder / "a_0.db3") as database:

@@ -254,6 +254,14 @@ def test_a_chunk_of_several_frames_is_read_to_its_end(tmp_path: Path, packer: Ca
     assert recover(path).files[0].damage == ""
 
 
+def test_a_plain_chunk_is_read_whatever_it_says_of_its_size_unpacked(tmp_path: Path) -> None:
+    records = foreign.message_records(foreign.drive(10))
+    said = foreign.record(Chunk("", records, foreign.START_NS, foreign.START_NS, 0, 7))
+    path = foreign.write_records(tmp_path / "a.mcap", foreign.announced(), said)
+    assert len(messages(path)) == 30
+    assert recover(path).files[0].damage == ""
+
+
 def test_a_message_of_several_frames_is_read_to_its_end(tmp_path: Path) -> None:
     plain = foreign.drive(10)
     packed = [(t, n, zstandard.compress(data[:9]) + zstandard.compress(data[9:])) for t, n, data in plain]
