@@ -10,11 +10,12 @@ import dataclasses
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from iwm_sim.faults import WHEELS, Fault
-from iwm_sim.road_run import check_scenario
+from iwm_sim.road_measures import driven, measured
+from iwm_sim.road_run import check_scenario, drive_scenario
 from iwm_sim.scenario import Bound, Demand, Friction, Scenario, load_scenario
 
 BASE = load_scenario("speed_high")
@@ -88,6 +89,28 @@ def test_no_single_wrong_sensor_takes_the_brakes(speed_mps, power_w, friction, b
 @DRAWN
 def test_no_single_wrong_sensor_of_many_takes_the_brakes(speed_mps, power_w, friction, broken):
     it_brakes(speed_mps, power_w, friction, broken)
+
+
+WRONG_FROM_STANDSTILL = st.one_of(
+    st.tuples(st.just("vehicle_speed"), st.floats(0.5, 2.0)), st.tuples(st.just("wheels"), st.floats(0.75, 1.25))
+)
+
+
+@settings(max_examples=5)
+@given(WRONG_FROM_STANDSTILL, st.floats(10e3, 25e3), st.floats(5e3, 40e3))
+def test_a_sensor_that_is_wrong_by_a_factor_from_standstill_on_takes_no_brakes(wrong_by, driven_w, braked_w):
+    target, factor = wrong_by
+    scenario = dataclasses.replace(
+        braking(0.0, braked_w, 0.9, (wrong(target, "factor", factor, 0.0),)),
+        demand=(Demand(0.0, "power_w", driven_w), Demand(4.0, "power_w", -braked_w)),
+        duration_s=9.0,
+        to_standstill=True,
+    )
+    run = driven(drive_scenario(scenario), scenario.truth)
+    assume(run["speed_mps"][run.braking] > 4.0)
+    found = measured(("least_braking", "longest_under_braked_s"), run)
+    assert found["least_braking"] >= 0.85
+    assert found["longest_under_braked_s"] <= 0.3
 
 
 @settings(max_examples=5)
