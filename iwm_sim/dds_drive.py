@@ -79,7 +79,7 @@ class Plan:
     realtime: bool
     record: bool
     output: Path
-    json: Path | None
+    json: str | None
     scenario: str = ""
     animate: Path | None = None
 

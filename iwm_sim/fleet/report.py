@@ -263,7 +263,7 @@ def page_of(store: Store) -> tuple[Page, list[Savings]]:
     return Page("A fleet", lead, blocks, contents_after=0), savings
 
 
-def make(folder: Path, page: Path, picture: Path | None = None, numbers: Path | None = None) -> None:
+def make(folder: Path, page: Path, picture: Path | None = None, numbers: str | None = None) -> None:
     """Write the page of a study, its first picture and its numbers, and print the savings."""
     store = Store(folder)
     made, savings = page_of(store)

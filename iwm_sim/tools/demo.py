@@ -20,6 +20,7 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES, d
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.exit_codes import INTERRUPTED
 from iwm_power_manager.model.parameters import IDLE_DRIVES
+from iwm_power_manager.tools.command import output_file
 from iwm_power_manager.tools.options import number
 from iwm_power_manager.tools.progress import show_compiling
 
@@ -90,7 +91,7 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
     parser.add_argument(
         "--output", metavar="DIR", type=Path, help="folder for everything that is made (default: runs/<date and time>)"
     )
-    parser.add_argument("--json", metavar="FILE", type=Path, help="also write the result's rows here")
+    parser.add_argument("--json", metavar="FILE", type=output_file, help="also write the result's rows here")
     parser.add_argument("--animate", metavar="GIF", type=Path, help="also draw the drive as a moving picture")
     given = parser.parse_args(arguments)
     if given.animate and (given.scenario or given.animate.suffix != ".gif"):

@@ -4,13 +4,11 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from iwm_power_manager import files
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.exit_codes import DONE, FAILED
@@ -68,7 +66,7 @@ def run_scenario(plan: Plan) -> int:
     for remark in outcome.remarks:
         print(remark)
     if plan.json:
-        files.atomic_write(plan.json, json.dumps(result.values, indent=1).encode() + b"\n")
+        command.write_json(plan.json, result.values)
     return DONE if outcome.complete and result.passed else FAILED
 
 
@@ -103,9 +101,9 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
     )
     write_page(plan.output / "drive.html", page)
     content = {"rows": [made.to_json() for made in rows], "settings": settings, "remarks": remarks}
-    stored = json.dumps(content, indent=1, allow_nan=False).encode() + b"\n"
-    for path in filter(None, (plan.output / "result.json", plan.json)):
-        files.atomic_write(path, stored)
+    command.write_json(plan.output / "result.json", content)
+    if plan.json:
+        command.write_json(plan.json, content)
     print(f"\n{plain_table(rows, COLUMNS, screen())}\n\n{made_with(plan, loaded)}")
     for remark in remarks:
         print(remark)

@@ -18,7 +18,7 @@ from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.control.strategies import drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.model.parameters import IDLE_DRIVES
-from iwm_power_manager.tools.command import described, ended, picture, write_json
+from iwm_power_manager.tools.command import described, ended, output_file, picture, write_json
 from iwm_power_manager.tools.options import number, several, whole
 from iwm_power_manager.tools.progress import Bar
 from iwm_sim.study.names import cores
@@ -61,7 +61,7 @@ def parser() -> argparse.ArgumentParser:
     report.add_argument("folder", type=Path, metavar="DIR", help="folder of a study")
     report.add_argument("--page", type=Path, metavar="HTML", help="the page (default: DIR/fleet.html)")
     report.add_argument("--picture", type=picture, metavar="PICTURE", help="its first picture: .pdf, .png or .svg")
-    report.add_argument("--json", type=Path, metavar="FILE", help="write what the page says as JSON")
+    report.add_argument("--json", type=output_file, metavar="FILE", help="write what the page says as JSON")
     return result
 
 
@@ -92,7 +92,7 @@ def _add_running(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--batch", type=number(0.0, 3600.0), default=2.0, metavar="S", help="seconds of work sent at once (default: 2)"
     )
-    group.add_argument("--json", type=Path, metavar="FILE", help="write what was done as JSON")
+    group.add_argument("--json", type=output_file, metavar="FILE", help="write what was done as JSON")
     group.add_argument("--quiet", action="store_true", help="no progress and no summary")
 
 
