@@ -18,7 +18,7 @@ from numba.core import config as numba_config
 from iwm_power_manager.control import friction, law, motion
 from iwm_power_manager.control.settings import GATE_MODES, default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.control.types import Agreed, ControllerState, Measurement, SideGrip, initial_state
+from iwm_power_manager.control.types import Agreed, Compared, ControllerState, Measurement, SideGrip, initial_state
 from iwm_power_manager.model.parameters import FrictionBrake, Motor, VehicleParams
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -276,6 +276,7 @@ class Scene:
             agreed=self.agreed,
             brake_gain=self.gains,
             wheels_factor=self.factor,
+            compared=Compared(*d.of((1.0, 0.0), (1.0, 0.3), (d.between(0.75, 1.3), d.of(0.1, 0.195, 0.3)))),
             calm_s=self.calm_s,
         )
         return start._replace(
