@@ -14,6 +14,7 @@ from iwm_power_manager.control import law
 from iwm_power_manager.control.actuators import (
     ActuatorLimits,
     ActuatorState,
+    Evidence,
     MotorVerdict,
     commanded,
     judge,
@@ -207,3 +208,10 @@ def test_friction_makes_up_for_a_stuck_motor_while_braking(wheel):
     totals = [a + b + c for a, b, c in zip(command.motor_torque_nm, command.friction_torque_nm, stuck, strict=True)]
     assert totals == pytest.approx([-20e3 / 4.0 / 15.0 * 0.33] * 4)
     assert violated_bound(command, car) == ""
+
+
+def test_gain_and_stuck_torque_belong_to_the_motor_that_has_them():
+    motors = tuple(Evidence(MotorVerdict.STUCK, gain=0.1 * i, stuck_nm=10.0 + i) for i in range(4))
+    state = ActuatorState(motors)
+    assert state.gains == (0.0, 0.1, 0.2, 0.1 * 3)
+    assert state.stuck_nm == (10.0, 11.0, 12.0, 13.0)
