@@ -85,6 +85,7 @@ def test_a_recorded_command_is_the_command():
 
 def test_a_record_that_is_older_than_a_signal_is_completed_in_any_order():
     _, _, numbers = driven(8e3, 12.0)
+    assert completed(SIGNAL_NAMES, numbers) == numbers
     recorded = dict(zip(SIGNAL_NAMES, numbers, strict=True))
     for young in ("hold_nm", "direction", "front_left_motor_gain", "setting.slip_target"):
         del recorded[young]

@@ -550,3 +550,14 @@ class TestApart:
         assert monitor.take_wheels(wheels(NOW, rims), NOW)
         assert words in monitor.apart
         assert bool(words) == bool(monitor.apart)
+
+    @pytest.mark.parametrize(("speed", "agree"), [(10.0, True), (11.4, True), (11.7, False), (9.0, True), (8.4, False)])
+    def test_they_agree_within_half_a_metre_a_second_and_a_tenth(self, monitor, speed, agree) -> None:
+        assert monitor.take_speed(SpeedReading(NOW, speed), NOW)
+        assert monitor.take_wheels(wheels(NOW), NOW)
+        assert monitor.agree is agree
+
+    def test_what_is_too_fast_is_told_with_how_fast_it_may_change(self, monitor) -> None:
+        assert monitor.take_speed(SpeedReading(NOW, 10.0), NOW)
+        assert not monitor.take_speed(SpeedReading(NOW + 10 * MS, 12.0), NOW + 10 * MS)
+        assert monitor.tallies[SPEED].why() == "too fast: 12; allowed: a change of 20 a second"
