@@ -57,7 +57,8 @@ def test_the_log_tells_the_way_from_start_to_end(start_pair) -> None:
     assert lines_with(running, "configured, 100 Hz: vehicle_speed from ")
     assert lines_with(running, ": active")
     bench.drive(lambda: lines_with(running, "first torque: "), "the first torque", soc=0.5)
-    bench.drive(lambda: lines_with(running, "all inputs are there: normal operation"), "normal operation")
+    # "all inputs are there", or "recovered" where the machine made it miss some before it was looked at.
+    bench.drive(lambda: lines_with(running, ": normal operation"), "normal operation")
     log = running.text()
     assert log.index("normal operation") < log.index("first torque: ")
     refused = "bench asks for another quality of service"
