@@ -12,7 +12,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from iwm_power_manager.control.motion import DOUBT_SPEED, STANDING_MPS
+from iwm_power_manager.control.motion import DOUBT_SPEED
+from iwm_power_manager.control.motion_vote import STANDING_MPS
 from iwm_power_manager.control.supervision import STALE_SPEED, STALE_WHEELS
 
 if TYPE_CHECKING:

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from iwm_power_manager.control import law
+from iwm_power_manager.control import allocation, law
 from iwm_power_manager.control import types as t
+from iwm_power_manager.control.axle import UNEQUAL_S
 from iwm_power_manager.control.budget import Used, buckets, burst
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.persistence import no_jitter
@@ -135,7 +136,7 @@ class Case(NamedTuple):
 
 def drive(m, before, s, car, table):
     """The law in the direction of travel, all sensors believed."""
-    return law.drive(m, before, True, 1.0, s, car, table)
+    return allocation.drive(m, before, True, 1.0, s, car, table)
 
 
 def take(m, before=None, s=DEFAULT, car=CAR):
@@ -313,7 +314,7 @@ def the_yaw_budget_of_an_axle_is_kept(case):
 
 def alike_on_both_sides_is_commanded_alike(case):
     w, states = case.m.wheel_speed_radps, case.before.wheels
-    if abs(case.before.front_unequal_s) > law.UNEQUAL_S:
+    if abs(case.before.front_unequal_s) > UNEQUAL_S:
         return  # one side has been seen to take more, and may go on with it
     for k in (0, 2):
         if w[k] == w[k + 1] and states[k] == states[k + 1]:

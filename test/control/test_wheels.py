@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iwm_power_manager.control import law
+from iwm_power_manager.control.direction import MOVING_MPS
 from iwm_power_manager.control.settings import GATE_MODE_OFF, default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.control.types import (
@@ -506,7 +507,7 @@ def test_five_speeds_that_agree_are_right_also_where_front_and_rear_wheels_diffe
 @pytest.mark.parametrize("part", [0.97, 1.03])
 def test_wheels_that_turn_end_the_hold_by_the_rim_of_the_front_wheels(wheel, part):
     """Held on a slope, while the speed sensor shows nothing yet: of the four it is the mean, whichever turns."""
-    wheels = one(wheel, 4.0 * part * law.MOVING_MPS / CAR.front.wheel.radius_m, (0.0,) * 4)
+    wheels = one(wheel, 4.0 * part * MOVING_MPS / CAR.front.wheel.radius_m, (0.0,) * 4)
     state = remembered(0.0, speed_radps=wheels)._replace(hold_nm=100.0)
     command, _ = step(measured(0.0, wheels, speed=0.0), state, OFF)
     assert command.hold_nm == (0.0 if part > 1.0 else 100.0)

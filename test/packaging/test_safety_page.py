@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from iwm_power_manager.control.car_restart import AWAY_S, STANDS_S
-from iwm_power_manager.control.law import HOLD_GRADE, MOVING_MPS
+from iwm_power_manager.control.direction import HOLD_GRADE, MOVING_MPS
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.ros.ending import LIMIT_S
 from iwm_power_manager.share import resolve, roots

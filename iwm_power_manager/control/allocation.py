@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the demand to the torques of four wheels, all in the direction of travel: steps 1 to 7 of the law."""
+
+from __future__ import annotations
+
+from iwm_power_manager.control.axle import (
+    Pair,
+    Shared,
+    alike_wheels,
+    friction_nm,
+    pair_capacity_w,
+    pair_limits,
+    pair_of,
+    shared_of,
+    slip_targets,
+    unequal_s,
+    yaw_moments_nm,
+)
+from iwm_power_manager.control.settings import GATE_MODE_OFF, Settings
+from iwm_power_manager.control.slip import worse_slip
+from iwm_power_manager.control.split import split
+from iwm_power_manager.control.table import PolicyTable
+from iwm_power_manager.control.types import (
+    LIMIT_BATTERY_CHARGE,
+    LIMIT_BATTERY_DISCHARGE,
+    Command,
+    ControllerState,
+    FourWheels,
+    Measurement,
+    SplitMemory,
+    Wheels,
+)
+from iwm_power_manager.control.wheel import wheel_after, wheel_slip
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.gate import gated_split
+from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
+from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.torque import allocate
+
+#: Part of the demand that sums and differences of powers may lose without a limit having bitten.
+ROUNDING = 1e-12
+
+
+@kernel
+def drive(
+    measurement: Measurement,
+    state: ControllerState,
+    slip_control: bool,
+    lower_part: float,
+    settings: Settings,
+    vehicle: VehicleParams,
+    policy: PolicyTable,
+) -> tuple[Command, ControllerState]:
+    """Steps 1 to 7, all in the direction of travel.
+
+    Parameters
+    ----------
+    measurement : speeds that are believed
+    state : of the step before
+    slip_control : gate and slip limiter may act
+    lower_part : a power that brakes is divided by this part of the speed (`motion.Motion`)
+    """
+    speed = max(measurement.speed_mps, 0.0)
+    dt = measurement.dt_s
+    braking = measurement.power_demand_w < 0.0
+    first = state.steps == 0
+    before = state.wheels
+
+    s = settings
+    front_s, rear_s = state.front_unequal_s, state.rear_unequal_s
+    targets = slip_targets(front_s, braking, s)
+    front_alike = alike_wheels(0, measurement, before, targets)
+    rear_alike = alike_wheels(2, measurement, before, targets)
+
+    # 1. slip, wheel by wheel; an axle's is that of its worse wheel
+    w = measurement.wheel_speed_radps
+    fl_slip = wheel_slip(w[0], speed, dt, first, before[0], vehicle.front, settings)
+    fr_slip = fl_slip if front_alike else wheel_slip(w[1], speed, dt, first, before[1], vehicle.front, settings)
+    rl_slip = wheel_slip(w[2], speed, dt, first, before[2], vehicle.rear, settings)
+    rr_slip = rl_slip if rear_alike else wheel_slip(w[3], speed, dt, first, before[3], vehicle.rear, settings)
+    front_slip = worse_slip(fl_slip, fr_slip)
+    rear_slip = worse_slip(rl_slip, rr_slip)
+
+    # 2. split
+    memory = split(measurement, speed, front_slip, rear_slip, first, state.split, settings, vehicle, policy)
+
+    # 3. gate, 4. capacity
+    mode = settings.gate_mode if slip_control else GATE_MODE_OFF
+    slips = (fl_slip, fr_slip, rl_slip, rr_slip)
+    front_nm = yaw_moments_nm(s.front_yaw_nm, s.front_yaw_growth_nmps, s.front_yaw_most_nm, front_s, speed, braking, s)
+    rear_nm = yaw_moments_nm(s.rear_yaw_nm, s.rear_yaw_growth_nmps, s.rear_yaw_most_nm, rear_s, speed, braking, s)
+    front = pair_of(
+        0, measurement, slips, speed, lower_part, mode, targets, front_nm, first, before, front_alike, vehicle.front, s,
+        vehicle,
+    )  # fmt: skip
+    rear = pair_of(
+        2, measurement, slips, speed, lower_part, mode, targets, rear_nm, first, before, rear_alike, vehicle.rear, s,
+        vehicle,
+    )  # fmt: skip
+    return _commanded(measurement, speed, front, rear, front_slip, rear_slip, memory, state, settings, vehicle)
+
+
+@kernel
+def _commanded(
+    measurement: Measurement,
+    speed_mps: float,
+    front: Pair,
+    rear: Pair,
+    front_slip: float,
+    rear_slip: float,
+    memory: SplitMemory,
+    state: ControllerState,
+    settings: Settings,
+    vehicle: VehicleParams,
+) -> tuple[Command, ControllerState]:
+    """Steps 4 to 7: from the power each axle is asked for to the torques that are commanded."""
+    demand, dt = measurement.power_demand_w, measurement.dt_s
+    braking = demand < 0.0
+    fl0, fr0, rl0, rr0 = state.wheels
+    front_gated = front.left.gated and front.right.gated
+    rear_gated = rear.left.gated and rear.right.gated
+    front_power, rear_power = gated_split(demand, memory.applied_share, front_gated, rear_gated)
+    front_asked, rear_asked = abs(front_power), abs(rear_power)
+    front_given, rear_given = allocate(front_asked, rear_asked, pair_capacity_w(front), pair_capacity_w(rear))
+
+    # 5. torque, 6. slew
+    f = shared_of(front_given, front, speed_mps, braking, dt, fl0, fr0, settings, vehicle.front)
+    r = shared_of(rear_given, rear, speed_mps, braking, dt, rl0, rr0, settings, vehicle.rear)
+    tolerance = ROUNDING * abs(demand)
+    # Where both axles together fall short, each of them is at its limit, whatever its own part was.
+    short = front_asked + rear_asked - front_given - rear_given > tolerance
+    front_short = short or front_asked - front_given > tolerance
+    rear_short = short or rear_asked - rear_given > tolerance
+    limits = pair_limits(front, f, front_short, braking, vehicle.front)
+    limits |= pair_limits(rear, r, rear_short, braking, vehicle.rear)
+
+    # 7. battery
+    w = measurement.wheel_speed_radps
+    wanted = (f.left.slewed_nm, f.right.slewed_nm, r.left.slewed_nm, r.right.slewed_nm)
+    scale = wheels_scale(wanted, w, measurement.discharge_limit_w, measurement.charge_limit_w, vehicle)
+    if scale < 1.0:
+        power = wheels_power_w(wanted, w, 1.0, vehicle)
+        limits |= LIMIT_BATTERY_CHARGE if power < 0.0 else LIMIT_BATTERY_DISCHARGE
+    motor = (scale * wanted[0], scale * wanted[1], scale * wanted[2], scale * wanted[3])
+    delivered = _delivered_nm(motor, measurement.motor_gain, measurement.motor_stuck_nm)
+    friction = _frictions_nm(front, f, rear, r, delivered, braking, vehicle)
+    fl_nm, fr_nm, rl_nm, rr_nm = _arrived_nm(delivered, friction, state.motion.brake_gain)
+    gate = (1 if front_gated else 0) + (2 if rear_gated else 0)
+    command = Command(
+        motor_torque_nm=motor,
+        friction_torque_nm=friction,
+        brake_gain=state.motion.brake_gain,
+        front_share=memory.applied_share,
+        decided_share=memory.decided_share,
+        gate=gate,
+        limits=limits,
+        front_power_w=front.left.conversion_radps * fl_nm + front.right.conversion_radps * fr_nm,
+        rear_power_w=rear.left.conversion_radps * rl_nm + rear.right.conversion_radps * rr_nm,
+        front_slip=front_slip,
+        rear_slip=rear_slip,
+        gated_wheels=_bits(front, rear),
+        speed_mps=measurement.speed_mps,
+        doubted=0,
+        hold_nm=0.0,
+        left_friction=0.0,
+        right_friction=0.0,
+        left_confidence=0.0,
+        right_confidence=0.0,
+    )
+    front_apart = braking and (fl_nm != fr_nm or front_short)
+    rear_apart = braking and (rl_nm != rr_nm or rear_short)
+    after = ControllerState(
+        steps=state.steps + 1,
+        split=memory,
+        wheels=_wheels_after(front, rear, motor, (fl_nm, fr_nm, rl_nm, rr_nm), state.wheels, dt, vehicle),
+        front_unequal_s=unequal_s(state.front_unequal_s, front.left, front.right, front_apart, dt),
+        rear_unequal_s=unequal_s(state.rear_unequal_s, rear.left, rear.right, rear_apart, dt),
+        motion=state.motion,
+        travel=state.travel,
+        hold_nm=state.hold_nm,
+        friction=state.friction,
+    )
+    return command, after
+
+
+@kernel
+def _delivered_nm(motor_nm: Wheels, gain: Wheels, stuck_nm: Wheels) -> Wheels:
+    """What arrives of the motors' torques."""
+    return (
+        gain[0] * motor_nm[0] + stuck_nm[0],
+        gain[1] * motor_nm[1] + stuck_nm[1],
+        gain[2] * motor_nm[2] + stuck_nm[2],
+        gain[3] * motor_nm[3] + stuck_nm[3],
+    )
+
+
+@kernel
+def _arrived_nm(delivered: Wheels, friction: Wheels, gain: Wheels) -> Wheels:
+    """Torque of motor and brake at each wheel."""
+    return (
+        delivered[0] + gain[0] * friction[0],
+        delivered[1] + gain[1] * friction[1],
+        delivered[2] + gain[2] * friction[2],
+        delivered[3] + gain[3] * friction[3],
+    )
+
+
+@kernel
+def _frictions_nm(
+    front: Pair, f: Shared, rear: Pair, r: Shared, delivered_nm: Wheels, braking: bool, vehicle: VehicleParams
+) -> Wheels:
+    """Friction torque of each wheel."""
+    return (
+        friction_nm(f.left, front.left.gated, delivered_nm[0], braking, vehicle.front),
+        friction_nm(f.right, front.right.gated, delivered_nm[1], braking, vehicle.front),
+        friction_nm(r.left, rear.left.gated, delivered_nm[2], braking, vehicle.rear),
+        friction_nm(r.right, rear.right.gated, delivered_nm[3], braking, vehicle.rear),
+    )
+
+
+@kernel
+def _wheels_after(
+    front: Pair,
+    rear: Pair,
+    motor_nm: Wheels,
+    total_nm: Wheels,
+    before: FourWheels,
+    dt_s: float,
+    vehicle: VehicleParams,
+) -> FourWheels:
+    """What is remembered of the four wheels."""
+    return (
+        wheel_after(front.left, motor_nm[0], total_nm[0], before[0], dt_s, vehicle.front),
+        wheel_after(front.right, motor_nm[1], total_nm[1], before[1], dt_s, vehicle.front),
+        wheel_after(rear.left, motor_nm[2], total_nm[2], before[2], dt_s, vehicle.rear),
+        wheel_after(rear.right, motor_nm[3], total_nm[3], before[3], dt_s, vehicle.rear),
+    )
+
+
+@kernel
+def _bits(front: Pair, rear: Pair) -> int:
+    """Bits of the wheels that are gated."""
+    front_bits = (1 if front.left.gated else 0) + (2 if front.right.gated else 0)
+    return front_bits + (4 if rear.left.gated else 0) + (8 if rear.right.gated else 0)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One wheel in one step of the law: its slip, its gate, and what its motor, its brake and its grip allow."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, Settings
+from iwm_power_manager.control.slip import UNLIMITED_NM, filtered, gained_radps, limiter_torque_nm, road_torque_nm
+from iwm_power_manager.control.types import WheelState
+from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.gate import axle_gated
+from iwm_power_manager.model.motor import heat_after, regeneration_limit_nm, torque_limit_nm
+from iwm_power_manager.model.parameters import Axle, VehicleParams
+from iwm_power_manager.model.torque import conversion_speed_radps
+from iwm_power_manager.model.tyre import slip_ratio
+
+#: Speed of a braked wheel as part of the car's that is still believed when power becomes torque.
+FASTEST_BRAKED = 1.12
+
+
+class Wheel(NamedTuple):
+    """One wheel in one step, before anything is commanded.
+
+    Attributes
+    ----------
+    speed_radps : measured
+    conversion_radps : speed by which its power is divided to get a torque
+    fast_radps : the larger of the two: what its motor's limits go by
+    road_nm : torque the road took from it, filtered
+    slip : filtered
+    gated : held at zero torque
+    actuator_nm : largest torque of motor or brake in the direction of the demand
+    gain : part of a commanded torque that its motor delivers
+    grip_nm : largest torque the slip limiter allows
+    """
+
+    speed_radps: float
+    conversion_radps: float
+    fast_radps: float
+    road_nm: float
+    slip: float
+    gated: bool
+    actuator_nm: float
+    gain: float
+    grip_nm: float
+
+
+@kernel
+def wheel_slip(
+    wheel_speed_radps: float,
+    speed_mps: float,
+    dt_s: float,
+    first: bool,
+    before: WheelState,
+    axle: Axle,
+    settings: Settings,
+) -> float:
+    """Slip of a wheel (eq. 10), filtered."""
+    measured = slip_ratio(wheel_speed_radps, speed_mps, axle.wheel.radius_m, settings.slip_speed_floor_mps)
+    return filtered(before.slip, measured, dt_s, 0.0 if first else settings.slip_filter_s)
+
+
+@kernel
+def wheel_of(
+    wheel_speed_radps: float,
+    slip: float,
+    gate_slip: float,
+    speed_mps: float,
+    demand_w: float,
+    gain: float,
+    lower_part: float,
+    gate_mode: int,
+    slip_target: float,
+    dt_s: float,
+    first: bool,
+    before: WheelState,
+    other_radps: float,
+    other_before: WheelState,
+    axle: Axle,
+    settings: Settings,
+    vehicle: VehicleParams,
+) -> Wheel:
+    """Steps 1, 3 and 4 for one wheel; `gate_slip` is the slip its gate goes by, `other` the axle's other wheel."""
+    braking = demand_w < 0.0
+    radius = axle.wheel.radius_m
+    # A braked wheel is not faster than the car: one that seems to be must not weaken the brakes.
+    turning = min(wheel_speed_radps, FASTEST_BRAKED * speed_mps / radius) if braking else wheel_speed_radps
+    conversion = conversion_speed_radps(
+        turning, speed_mps, settings.critical_slip, radius, vehicle.driver.power_speed_floor_mps
+    )
+    if braking:
+        conversion *= lower_part
+    fast = max(wheel_speed_radps, conversion)
+    road = 0.0
+    if not first:
+        gained = gained_radps(before, wheel_speed_radps, other_before, other_radps, radius)
+        taken = road_torque_nm(before.total_nm, gained, dt_s, axle.wheel.inertia_kgm2)
+        road = filtered(before.road_nm, taken, dt_s, settings.slip_filter_s)
+        if wheel_speed_radps == other_radps:
+            # One stands in for the other, which is not believed: nothing would ever tell their torques apart.
+            other_taken = road_torque_nm(other_before.total_nm, gained, dt_s, axle.wheel.inertia_kgm2)
+            road = 0.5 * (road + filtered(other_before.road_nm, other_taken, dt_s, settings.slip_filter_s))
+    gated = False
+    # The brakes have to be able to hold a car at rest: what is slip there, sensors cannot tell.
+    if gate_mode != GATE_MODE_OFF and not (braking and speed_mps < settings.slip_speed_floor_mps):
+        gated = axle_gated(
+            gate_slip, demand_w, before.gated, settings.critical_slip, settings.gate_hysteresis, settings.gate_driving
+        )
+    grip = UNLIMITED_NM
+    if gate_mode == GATE_MODE_LIMITER:
+        grip = limiter_torque_nm(
+            braking,
+            road,
+            wheel_speed_radps,
+            speed_mps,
+            slip_target,
+            settings.slip_limiter_s,
+            settings.slip_speed_floor_mps,
+            radius,
+            axle.wheel.inertia_kgm2,
+        )
+    return Wheel(
+        speed_radps=wheel_speed_radps,
+        conversion_radps=conversion,
+        fast_radps=fast,
+        road_nm=road,
+        slip=slip,
+        gated=gated,
+        actuator_nm=max(
+            axle.friction_brake.max_torque_nm, gain * regeneration_limit_nm(fast, speed_mps, before.heat, axle.motor)
+        )
+        if braking
+        else gain * torque_limit_nm(fast, before.heat, axle.motor),
+        gain=gain,
+        grip_nm=grip,
+    )
+
+
+@kernel
+def capacity_nm(wheel: Wheel) -> float:
+    """Largest torque of a wheel in the direction of the demand, N m >= 0."""
+    return 0.0 if wheel.gated else min(wheel.actuator_nm, wheel.grip_nm)
+
+
+@kernel
+def wheel_after(
+    wheel: Wheel, motor_nm: float, total_nm: float, before: WheelState, dt_s: float, axle: Axle
+) -> WheelState:
+    """What is remembered of a wheel."""
+    return WheelState(
+        motor_nm=motor_nm,
+        total_nm=total_nm,
+        speed_radps=wheel.speed_radps,
+        road_nm=wheel.road_nm,
+        slip=wheel.slip,
+        gated=wheel.gated,
+        heat=heat_after(before.heat, motor_nm, dt_s, axle.motor),
+    )
