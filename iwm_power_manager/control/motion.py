@@ -48,8 +48,6 @@ from iwm_power_manager.control.speed_doubt import (
 from iwm_power_manager.control.types import FourWheels, Measurement, MotionState, Wheels
 from iwm_power_manager.control.wheel_doubt import (
     SLOW_MPS,
-    SPEED_MPS,
-    SPEED_PART,
     clamped,
     combined_factor,
     common_jump,
@@ -84,7 +82,6 @@ class Motion(NamedTuple):
     Attributes
     ----------
     speed_mps : speed to use, negative backwards
-    uncertainty_mps : how wrong it may be
     wheel_speed_radps : wheel speeds to use; one that is not believed has that of its axle's other wheel, or rolls
     lower_part : the lower of two speeds, as part of the one used, where sensor and wheels differ by a quarter at most
         and nothing tells which of them is wrong; else 1
@@ -92,7 +89,6 @@ class Motion(NamedTuple):
     """
 
     speed_mps: float
-    uncertainty_mps: float
     wheel_speed_radps: Wheels
     lower_part: float
     doubted: int
@@ -191,7 +187,6 @@ def estimate(
     used = shown if trusted else reference
     motion = Motion(
         speed_mps=used,
-        uncertainty_mps=0.1 + SPEED_PART * abs(used) if trusted else SPEED_MPS + 2.0 * WHEEL_PART * abs(used),
         wheel_speed_radps=wheels_to_use(w, doubt, used, rolling.believed, demand, vehicle),
         lower_part=lower_part_of(shown, reference, trusted, before.compared),
         doubted=_doubted(trusted, doubt, factor),

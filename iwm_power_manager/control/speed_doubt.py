@@ -55,8 +55,8 @@ class Rolling(NamedTuple):
 @kernel
 def used_friction_of(torque_nm: Wheels, t: Turning) -> float:
     """The largest of four torques at the wheels, as part of the wheel's load."""
-    a, b, c, d = torque_nm
-    return max(max(abs(a), abs(b)) / t.front_nm, max(abs(c), abs(d)) / t.rear_nm)
+    front_nm, rear_nm = max(abs(torque_nm[0]), abs(torque_nm[1])), max(abs(torque_nm[2]), abs(torque_nm[3]))
+    return max(front_nm / t.front_nm, rear_nm / t.rear_nm)
 
 
 @kernel
