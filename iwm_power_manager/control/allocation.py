@@ -97,7 +97,9 @@ def drive(
         2, measurement, slips, speed, lower_part, mode, targets, rear_nm, first, before, rear_alike, vehicle.rear, s,
         vehicle,
     )  # fmt: skip
-    return _commanded(measurement, speed, front, rear, front_slip, rear_slip, memory, state, settings, vehicle)
+    # Without slip control nothing keeps a single axle from locking.
+    share = memory.applied_share if slip_control else 0.5
+    return _commanded(measurement, speed, front, rear, front_slip, rear_slip, memory, share, state, settings, vehicle)
 
 
 @kernel
@@ -109,6 +111,7 @@ def _commanded(
     front_slip: float,
     rear_slip: float,
     memory: SplitMemory,
+    share: float,
     state: ControllerState,
     settings: Settings,
     vehicle: VehicleParams,
@@ -119,7 +122,7 @@ def _commanded(
     fl0, fr0, rl0, rr0 = state.wheels
     front_gated = front.left.gated and front.right.gated
     rear_gated = rear.left.gated and rear.right.gated
-    front_power, rear_power = gated_split(demand, memory.applied_share, front_gated, rear_gated)
+    front_power, rear_power = gated_split(demand, share, front_gated, rear_gated)
     front_asked, rear_asked = abs(front_power), abs(rear_power)
     front_given, rear_given = allocate(front_asked, rear_asked, pair_capacity_w(front), pair_capacity_w(rear))
 
@@ -145,14 +148,13 @@ def _commanded(
     delivered = _delivered_nm(motor, measurement.motor_gain, measurement.motor_stuck_nm)
     friction = _frictions_nm(front, f, rear, r, delivered, braking, vehicle)
     fl_nm, fr_nm, rl_nm, rr_nm = _arrived_nm(delivered, friction, state.motion.brake_gain)
-    gate = (1 if front_gated else 0) + (2 if rear_gated else 0)
     command = Command(
         motor_torque_nm=motor,
         friction_torque_nm=friction,
         brake_gain=state.motion.brake_gain,
-        front_share=memory.applied_share,
+        front_share=share,
         decided_share=memory.decided_share,
-        gate=gate,
+        gate=front_gated + 2 * rear_gated,
         limits=limits,
         front_power_w=front.left.conversion_radps * fl_nm + front.right.conversion_radps * fr_nm,
         rear_power_w=rear.left.conversion_radps * rl_nm + rear.right.conversion_radps * rr_nm,
