@@ -603,7 +603,7 @@ def fleet_rows(found: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 PROGRAMS: dict[str, tuple[list[str], Callable[[dict[str, Any]], list[tuple[str, ...]]]]] = {
-    "bags": (["bags.py", "--messages", "50000", "--steps", "3000"], bag_rows),
+    "bags": (["bags.py", "--steps", "3000"], bag_rows),
     "start": (["cold_start.py"], start_rows),
     "fleet": (["fleet.py"], fleet_rows),
 }
