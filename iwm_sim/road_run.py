@@ -95,7 +95,7 @@ def give(controller: Controller, sensors: Sensors, drive: Drive, now_ns: int) ->
         monitor.take_speed(SpeedReading(now_ns, sensors.speed_mps), now_ns)
     if not drive.lost("wheel_states"):
         monitor.take_wheels(JointReading(now_ns, WHEELS, sensors.wheel_speed_radps), now_ns)
-        monitor.take_torques(JointReading(now_ns, WHEELS, sensors.motor_torque_nm))
+        monitor.take_torques(JointReading(now_ns, WHEELS, sensors.motor_torque_nm), now_ns)
     if not drive.lost("battery_state"):
         battery = BatteryReading(
             now_ns,

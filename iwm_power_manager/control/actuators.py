@@ -7,7 +7,8 @@ of reported to commanded torque over that time: dead, weak, reversed, or stuck w
 The torque the law may count on is `gain` times what it commands; a motor that does not follow is switched off.
 
 Reports are only judged once some motor has been seen to follow its commands: a car that fills the field with zeros does
-not report. What was found stays until the next activation, except a weak motor that follows again for `recover_s`.
+not report, nor does one all of whose motors seem to be stuck or reversed. What else was found stays until the next
+activation, except a weak motor that follows again for `recover_s`.
 
 Pure functions over numbers; one call a step for each motor.
 """
@@ -139,6 +140,8 @@ def judge(state: ActuatorState, reported_nm: Wheels, dt_s: float, limits: Actuat
     if not reporting:
         return state
     a, b, c, d = (_judged(motor, *report, dt_s, limits) for motor, report in zip(state.motors, reports, strict=True))
+    if all(motor.verdict in (MotorVerdict.STUCK, MotorVerdict.REVERSED) for motor in (a, b, c, d)):
+        return ActuatorState(recent=state.recent)  # four motors do not get stuck at once: the reports did
     return ActuatorState((a, b, c, d), state.recent, True)
 
 

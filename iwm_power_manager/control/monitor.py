@@ -330,8 +330,13 @@ class InputMonitor:
             tally.dropped[violation] += 1
         return True
 
-    def take_torques(self, reading: JointReading) -> None:
-        """Keep what the motors report. Nothing is judged here: `control.actuators` holds it against the commands."""
+    def take_torques(self, reading: JointReading, now_ns: int) -> None:
+        """Keep what the motors report: `control.actuators` holds it against the commands of the last moments.
+
+        A report of another time would make every motor a stuck one.
+        """
+        if self._limits.stamp and check_stamp(reading.stamp_ns, None, now_ns, self._limits.stamp):
+            return
         a, b, c, d = select_by_name(reading, self._wheel_names)
         self.motor_torque_nm = (a, b, c, d)
 

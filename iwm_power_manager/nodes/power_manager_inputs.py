@@ -214,7 +214,7 @@ def judge(monitor: InputMonitor, reading: Any, now_ns: int) -> None:
     elif kind is FrictionReading:
         monitor.take_friction(reading.friction, now_ns)
     elif kind is TorqueReading:
-        monitor.take_torques(reading)
+        monitor.take_torques(reading, now_ns)
     elif kind is DirectionReading:
         monitor.direction = reading.direction
     elif kind is MotionReading and reading.signal == "longitudinal_acceleration":

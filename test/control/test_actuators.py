@@ -184,16 +184,25 @@ def test_what_a_motor_has_lost_comes_from_the_others_and_the_brakes(wheel, gain,
 
 def test_a_motor_that_pulls_although_it_is_switched_off_is_stuck_with_that_torque_until_it_stops():
     # It looks reversed at first, since it is braked with and pulls.
-    looks = drive(following(), steady(-60.0, 20), [(60.0,) * 4] * 20)[-1]
+    looks = drive(following(), steady(-60.0, 20), [(60.0, -60.0, -60.0, -60.0)] * 20)[-1]
     assert looks.motors[0].verdict is MotorVerdict.REVERSED
-    states = drive(looks, steady(0.0, 30), [(55.0,) * 4] * 30)
+    states = drive(looks, steady(0.0, 30), [(55.0, 0.0, 0.0, 0.0)] * 30)
     assert states[2].stuck_nm == (0.0,) * 4, "its last command may still be under way"
     assert states[-1].motors[0].verdict is MotorVerdict.STUCK
-    assert states[-1].stuck_nm == (55.0,) * 4
-    assert states[-1].gains == (0.0,) * 4
+    assert states[-1].stuck_nm == (55.0, 0.0, 0.0, 0.0)
+    assert states[-1].gains == (0.0, 1.0, 1.0, 1.0)
     unknown = drive(states[-1], steady(0.0, 5), [(math.nan,) * 4] * 5)[-1]
-    assert unknown.stuck_nm == (55.0,) * 4
+    assert unknown.stuck_nm == (55.0, 0.0, 0.0, 0.0)
     assert drive(unknown, steady(0.0, 5), steady(0.0, 5))[-1].stuck_nm == (0.0,) * 4
+
+
+@pytest.mark.parametrize("torque", [0.0, -60.0, 150.0])
+def test_reports_of_all_motors_that_stand_still_switch_none_off_for_good(torque):
+    states = drive(following(), steady(torque, 100), [(60.0, 61.0, 59.0, 60.0)] * 100)
+    again = drive(states[-1], steady(60.0, 250), steady(60.0, 250))[-1]
+    assert again.gains == (1.0,) * 4
+    dead = drive(again, steady(60.0, 30), [(60.0, 0.0, 60.0, 60.0)] * 30)[-1]
+    assert dead.motors[1].verdict is MotorVerdict.DEAD
 
 
 @pytest.mark.parametrize("wheel", range(4))

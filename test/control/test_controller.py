@@ -316,7 +316,7 @@ class TestMotorReports:
         drive.run(60, demand=9000.0)
         for _ in range(60):
             torques = [0.0 if i == 1 else torque for i, torque in enumerate(motor(drive.steps[-1]))]
-            drive.controller.monitor.take_torques(JointReading(drive.now_ns, NAMES, tuple(torques)))
+            drive.controller.monitor.take_torques(JointReading(drive.now_ns, NAMES, tuple(torques)), drive.now_ns)
             values = drive.run(1, demand=9000.0)
         assert motor(values)[1] == 0.0
         assert motor(values)[0] > 1.0

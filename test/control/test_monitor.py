@@ -400,17 +400,22 @@ class TestFriction:
 class TestMotorTorques:
     def test_each_motor_has_the_torque_that_bears_its_name(self, monitor) -> None:
         monitor.take_torques(
-            wheels(NOW, (3.0, 1.0, 4.0, 2.0), ("rear_left", "front_left", "rear_right", "front_right"))
+            wheels(NOW, (3.0, 1.0, 4.0, 2.0), ("rear_left", "front_left", "rear_right", "front_right")), NOW
         )
         assert monitor.collect_torques() == (1.0, 2.0, 3.0, 4.0)
 
     def test_a_report_counts_once_and_a_motor_that_did_not_report_has_none(self, monitor) -> None:
         assert monitor.collect_torques() is None
-        monitor.take_torques(wheels(NOW, (5.0, 6.0), ("front_left", "rear_right")))
+        monitor.take_torques(wheels(NOW, (5.0, 6.0), ("front_left", "rear_right")), NOW)
         first, second, third, fourth = monitor.collect_torques()
         assert (first, fourth) == (5.0, 6.0)
         assert math.isnan(second)
         assert math.isnan(third)
+        assert monitor.collect_torques() is None
+
+    @pytest.mark.parametrize("late_ms", [-500, 500, 10_000])
+    def test_a_report_of_another_time_is_none(self, monitor, late_ms) -> None:
+        monitor.take_torques(wheels(NOW, (5.0, 6.0, 7.0, 8.0)), NOW + late_ms * MS)
         assert monitor.collect_torques() is None
 
 
