@@ -19,9 +19,6 @@ from member import domain
 
 from iwm_power_manager.ros import ending
 
-# A `main` that is called here leaves DDS; the test run, with far more garbage than a node has, is not to end with it.
-ending.LIMIT_S = 600.0
-
 MODULE = "iwm_power_manager.nodes.power_manager"
 #: Runs without a policy file, which is all most tests need.
 EQUAL = {"strategy": "equal", "policy_file": ""}
@@ -65,6 +62,8 @@ class Pair:
 
 @pytest.fixture(scope="session", autouse=True)
 def _leaves_dds_last() -> Iterator[None]:
+    # A `main` that is called here leaves DDS; the test run, with far more garbage than a node, is not to end with it.
+    ending.LIMIT_S = 600.0
     yield
     member.leave()
 
