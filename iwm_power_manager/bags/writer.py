@@ -22,7 +22,7 @@ from typing import Any, Self
 
 from iwm_power_manager import __version__
 from iwm_power_manager.bags import metadata
-from iwm_power_manager.bags.mcap_file import McapFile
+from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
 from iwm_power_manager.bags.mcap_source import RECORD_OVERHEAD_BYTES
 from iwm_power_manager.errors import BagError, ConfigError
 from iwm_power_manager.files import atomic_write, sync_folder
@@ -52,6 +52,14 @@ class WriterOptions:
     max_bytes: int = 0
     max_duration_ns: int = 0
     max_message_bytes: int = 64 * 1024 * 1024
+
+    def __post_init__(self) -> None:
+        if self.compression not in COMPRESSIONS:
+            raise BagError(f"compression: {self.compression!r} is unknown; allowed: {' | '.join(COMPRESSIONS)}")
+        for name, low in (("chunk_bytes", 1024), ("max_bytes", 0), ("max_duration_ns", 0), ("max_message_bytes", 1)):
+            value = getattr(self, name)
+            if value < low:
+                raise BagError(f"{name}: {value} is too small; allowed: >= {low}")
 
 
 class MessageTooLarge(BagError):

@@ -155,6 +155,14 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         BagWriter(tmp_path / "file" / "bag")
 
 
+@pytest.mark.parametrize(
+    ("option", "value"), [("compression", "gzip"), ("chunk_bytes", 10), ("max_bytes", -1), ("max_message_bytes", 0)]
+)
+def test_a_wrong_option_is_named_with_what_is_allowed(option: str, value: object) -> None:
+    with pytest.raises(BagError, match=rf"{option}: .*{value}.* allowed: "):
+        WriterOptions(**{option: value})  # type: ignore[arg-type]
+
+
 def test_what_was_written_before_the_disk_was_full_stays_readable(tmp_path: Path) -> None:
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     bag = BagWriter(tmp_path / "bag", WriterOptions(compression="none", chunk_bytes=8192))
