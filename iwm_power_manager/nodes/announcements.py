@@ -12,11 +12,12 @@ from iwm_power_manager.control.controller import Controller
 from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import BATTERY, DEMAND, FRICTION, SPEED, WHEELS
 from iwm_power_manager.control.supervision import MODE_DEGRADED, MODE_NORMAL, MODE_WAITING, STALE_NAMES
+from iwm_power_manager.nodes.neighbours import nobody_obeys
 from iwm_power_manager.nodes.preparation import SLOW_S, Prepared
 from iwm_power_manager.signals import mapping
 
-#: What the node waits for is said again after this time.
-REPEAT_S = 5.0
+#: What the node waits for is said again after this time, and that nobody obeys it after the longer one.
+REPEAT_S, SELDOM_S = 5.0, 30.0
 #: A car that starts or dies changes what is there several times within this time.
 SETTLED_S = 0.9
 
@@ -62,8 +63,10 @@ class Announcements:
         self._was_degraded = False
         self._torque_seen = False
         self._late_s: dict[str, float] = {}
+        self._unobeyed: set[str] = set()  # topics of which that has been told
         self._said.clear()
         self._said["waiting"] = time.monotonic() - REPEAT_S + 1.0  # inputs get a second to come before
+        self._said["commands"] = time.monotonic() - SELDOM_S + 1.0
 
     def preparing(self, elapsed_s: float) -> None:
         """Tell that it takes long, again and again."""
@@ -98,6 +101,15 @@ class Announcements:
         self._said["waiting"] = time.monotonic() - REPEAT_S + 1.0
         if self._due(reason):
             self._logger.warning(f"{reason}: it starts over, as after activation")
+
+    def commands(self, unobeyed: list[str]) -> None:
+        """Tell now and then which topics of commands nobody subscribes to, and once that somebody does."""
+        if found := sorted(self._unobeyed.difference(unobeyed)):
+            self._logger.info(f"somebody subscribes to {', '.join(found)} now")
+        self._unobeyed.intersection_update(unobeyed)
+        if unobeyed and self._due("commands", SELDOM_S):
+            self._logger.warning(f"{nobody_obeys(unobeyed)}: its commands move nothing")
+            self._unobeyed.update(unobeyed)
 
     def pedals(self, remarks: Mapping[str, tuple[bool, str]]) -> None:
         """Tell once what is odd about each pedal, and warn of what is sure (`Assembly.remarks`)."""
@@ -216,9 +228,9 @@ class Announcements:
         ages_ns = {topic: now_ns - self._heard_ns.get(topic, 0) for topic in topics}
         return tuple(topic for topic, age_ns in ages_ns.items() if 2 * age_ns > max(ages_ns.values()))
 
-    def _due(self, what: str) -> bool:
+    def _due(self, what: str, every_s: float = REPEAT_S) -> bool:
         now = time.monotonic()
-        if now - self._said.get(what, -REPEAT_S) < REPEAT_S:
+        if now - self._said.get(what, -math.inf) < every_s:
             return False
         self._said[what] = now
         return True

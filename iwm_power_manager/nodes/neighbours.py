@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Who else is on the power manager's topics: other commanders, second sources, and whoever cannot be connected with."""
+"""Who else is on the power manager's topics: who obeys, other commanders, second sources, who cannot be connected."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from iwm_power_manager.nodes.power_manager_outputs import Outputs
 from iwm_power_manager.ros import diagnostics
 from iwm_power_manager.ros.matching import mismatched_publishers, mismatched_subscribers
 
+#: Nodes that hear commands and obey none: this package's own, rosbag2's, and those of the command `ros2`.
+_WATCHERS, _COMMAND_LINE = ("recorder", "watch_car", "rosbag2_recorder"), "_ros2cli"
+
 
 class Neighbours(NamedTuple):
     """What was found.
@@ -21,11 +24,13 @@ class Neighbours(NamedTuple):
     statuses : for `/diagnostics`
     problems : a line each
     unheard : why a topic is not heard, or not well, by topic
+    unobeyed : topics of commands that nobody subscribes to
     """
 
     statuses: list[diagnostics.Status]
     problems: list[str]
     unheard: dict[str, str]
+    unobeyed: list[str]
 
 
 def look(node: Node, inputs: Inputs, outputs: Outputs, slow: dict[str, str]) -> Neighbours:
@@ -34,9 +39,13 @@ def look(node: Node, inputs: Inputs, outputs: Outputs, slow: dict[str, str]) -> 
     commanders = {topic: node.count_publishers(topic) for topic in map(node.resolve_topic_name, outputs.topics)}
     deaf = _lines(mismatched_subscribers(node, outputs.publishers, types))
     wrong = [*_shared(commanders), *deaf]
+    obeying = {topic: _obeying(node, topic) for topic in commanders}
+    unobeyed = [topic for topic, count in obeying.items() if not count]
     values = {f"{topic}: publishers": str(count) for topic, count in commanders.items()}
-    level = diagnostics.ERROR if wrong else diagnostics.OK
-    statuses = [diagnostics.Status("command topics", level, "; ".join(wrong) or "ok", values)]
+    values |= {f"{topic}: subscriptions": str(count) for topic, count in obeying.items()}
+    level = diagnostics.ERROR if wrong else diagnostics.WARN if unobeyed else diagnostics.OK
+    lines = [*wrong, *([nobody_obeys(unobeyed)] if unobeyed else [])]
+    statuses = [diagnostics.Status("command topics", level, "; ".join(lines) or "ok", values)]
     mismatches = mismatched_publishers(node, inputs.subscriptions, types, inputs.how_to_hear)
     unheard = _lines(mismatches)
     senders = {found.topic_name: node.count_publishers(found.topic_name) for found in inputs.subscriptions}
@@ -50,7 +59,18 @@ def look(node: Node, inputs: Inputs, outputs: Outputs, slow: dict[str, str]) -> 
         for topic, count in senders.items()
         if not count or topic not in inputs.heard_ns
     }
-    return Neighbours(statuses, [*wrong, *heard_badly], slow | silent | mismatches)
+    return Neighbours(statuses, [*wrong, *heard_badly], slow | silent | mismatches, unobeyed)
+
+
+def nobody_obeys(topics: list[str]) -> str:
+    """What is said of commands that go nowhere."""
+    return f"nobody subscribes to {', '.join(topics)}"
+
+
+def _obeying(node: Node, topic: str) -> int:
+    """Subscriptions to a topic, without those of nodes that are known to watch only."""
+    names = [info.node_name for info in node.get_subscriptions_info_by_topic(topic)]
+    return sum(name not in _WATCHERS and not name.startswith(_COMMAND_LINE) for name in names)
 
 
 def _lines(reasons: dict[str, str]) -> list[str]:

@@ -44,6 +44,6 @@ def spin(node: PowerManager, interruption: Interruption) -> None:
             executor.spin_once(timeout_sec=0.0 if node.step_when_due() else None)
         except Exception as error:  # noqa: BLE001 - whatever it is, the motors must not be left with a command
             node.fail(f"{type(error).__name__}: {error}")
-    with ending.deadline(DONE):  # the command is out at once; what DDS does after it may take for ever
+    with ending.deadline(DONE, ending.SHORT_S):  # the command is out at once; what DDS does after it may take for ever
         node.stop()
         executor.shutdown()

@@ -79,7 +79,7 @@ def _run(interruption: Interruption, args: list[str] | None) -> int:
         print(f"power_manager: {str(error).splitlines()[0]}", file=sys.stderr)
     finally:
         compiling = node is not None and node.preparing
-        with ending.bounded(code):
+        with ending.bounded(code, ending.SHORT_S if compiling else None):
             if node is not None:
                 node.stop()
                 node.destroy_node()

@@ -460,6 +460,7 @@ class PowerManager(Starting):
             slow = {} if self._lockstep else self._inputs.slow(self._topics, self._values, self._now_ns())
             found = neighbours.look(self, self._inputs, self._outputs, slow)
             self._unheard = found.unheard
+            self._says.commands(found.unobeyed)
             self._says.problems([*found.problems, *self._report.doubts])
             statuses += found.statuses
         return statuses

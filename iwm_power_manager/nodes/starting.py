@@ -15,6 +15,17 @@ from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.preparation import Preparation, Prepared
 from iwm_power_manager.ros.parameters import KeepsItsValues
 
+#: What a transition is called that is asked for by its number.
+_LABELS = {
+    Transition.TRANSITION_CONFIGURE: "configure",
+    Transition.TRANSITION_CLEANUP: "cleanup",
+    Transition.TRANSITION_ACTIVATE: "activate",
+    Transition.TRANSITION_DEACTIVATE: "deactivate",
+    Transition.TRANSITION_UNCONFIGURED_SHUTDOWN: "shutdown",
+    Transition.TRANSITION_INACTIVE_SHUTDOWN: "shutdown",
+    Transition.TRANSITION_ACTIVE_SHUTDOWN: "shutdown",
+}
+
 
 class Starting(KeepsItsValues, LifecycleNode):
     """The part of the power manager that gets it to active.
@@ -101,12 +112,23 @@ class Starting(KeepsItsValues, LifecycleNode):
         if configure and self._is_possible(wanted):
             await self._prepare()  # other services are answered meanwhile
         if not self._is_possible(wanted):
-            name = wanted.label or wanted.id
-            self.get_logger().warning(f"there is no transition {name} from state {self.lifecycle_state()}")
+            self.get_logger().warning(f"{_named(wanted)} is refused: {self._possible_in_words()}")
             response.success = False
             return response
         return self._change_state(request, response)
 
+    def _possible(self) -> list[Transition]:
+        return [Transition(id=found[0], label=found[1]) for found in self._state_machine.available_transitions]
+
     def _is_possible(self, wanted: Transition) -> bool:
-        possible = {(found[0], found[1]) for found in self._state_machine.available_transitions}
-        return any(wanted.label == label if wanted.label else wanted.id == number for number, label in possible)
+        return any(wanted.label == found.label if wanted.label else wanted.id == found.id for found in self._possible())
+
+    def _possible_in_words(self) -> str:
+        found = ", ".join(map(_named, self._possible()))
+        return f"the node is {self.lifecycle_state()}" + (f", from where it can {found}" if found else "")
+
+
+def _named(transition: Transition) -> str:
+    """Label and number of a transition, as far as they are known."""
+    label = transition.label or _LABELS.get(transition.id, "transition")
+    return f"{label} ({transition.id})" if transition.id else label

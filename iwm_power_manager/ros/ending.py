@@ -21,8 +21,10 @@ import rclpy
 from iwm_power_manager.ros import realtime
 
 #: Leaving takes less than 0.1 s on an idle machine; on one with far too much to do, a second or two. Launch waits 5 s
-#: before it calls a node that was asked to end unresponsive.
+#: before it calls a node that was asked to end unresponsive: time enough for this, and for `SHORT_S` before and after.
 LIMIT_S = 3.0
+#: For what comes before and after leaving DDS, each; and for all of it where nothing was begun that has to end well.
+SHORT_S = 0.9
 
 _CLOCK_MONOTONIC, _SIGEV_THREAD = 1, 2
 
@@ -81,7 +83,7 @@ def bounded(code: int, limit_s: float | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def deadline(code: int, limit_s: float = LIMIT_S) -> Iterator[None]:
+def deadline(code: int, limit_s: float) -> Iterator[None]:
     """End the process with an exit code if the body of the `with` takes longer."""
     timer = _start_timer(code, limit_s)
     try:
@@ -99,7 +101,7 @@ def at_exit(code: int) -> int:
     int
         The same exit code, for `sys.exit`.
     """
-    _start_timer(code, LIMIT_S)
+    _start_timer(code, SHORT_S)
     return code
 
 

@@ -36,13 +36,14 @@ class Pair:
         *,
         sim_time: bool = False,
         environment: dict[str, str] | None = None,
+        remaps: dict[str, str] | None = None,
     ) -> None:
         Pair.count += 1
         namespace = f"/test_{os.getpid()}_{Pair.count}"
         self.bench = Bench(lockstep=bool(parameters.get("lockstep")), namespace=namespace, sim_time=sim_time)
-        remaps = {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics", "/clock": f"{namespace}/clock"}
+        names = {"__ns": namespace, "/diagnostics": f"{namespace}/diagnostics", "/clock": f"{namespace}/clock"}
         given = {name.replace("{namespace}", namespace): value for name, value in parameters.items()}
-        self.arguments = arguments({**EQUAL, **given, "use_sim_time": sim_time}, remaps)
+        self.arguments = arguments({**EQUAL, **given, "use_sim_time": sim_time}, names | (remaps or {}))
         # The node as it is shipped, which shares no memory; only the bench announces itself more often than usual.
         self._environment = {"FASTRTPS_DEFAULT_PROFILES_FILE": "", **(environment or {})}
         self._folder = folder
@@ -63,7 +64,7 @@ class Pair:
 @pytest.fixture(scope="session", autouse=True)
 def _leaves_dds_last() -> Iterator[None]:
     # A `main` that is called here leaves DDS; the test run, with far more garbage than a node, is not to end with it.
-    ending.LIMIT_S = 600.0
+    ending.LIMIT_S = ending.SHORT_S = 600.0
     yield
     member.leave()
 

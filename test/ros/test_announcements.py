@@ -135,3 +135,26 @@ def test_refused_messages_are_counted_by_their_reason_and_a_described_one_names_
         "degraded, motor torque fades: power_demand (1 messages refused, "
         "out of range: accelerator_pedal 300 % on accelerator; allowed: 0 to 100)"
     )
+
+
+def test_commands_that_nobody_obeys_are_told_seldom_and_once_that_somebody_does(
+    log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 1000.0
+    monkeypatch.setattr("time.monotonic", lambda: now_s)
+    says = Announcements(log)
+    for second in range(40):
+        now_s = 1000.0 + second
+        says.commands(["/motors", "/brakes"])
+    line = "nobody subscribes to /motors, /brakes: its commands move nothing"
+    assert log.lines == [line, line]
+    for _ in range(3):
+        says.commands(["/brakes"])
+    assert log.lines[2:] == ["somebody subscribes to /motors now"]
+
+
+def test_who_obeys_within_a_moment_of_activation_is_no_news(log: Log) -> None:
+    says = Announcements(log)
+    says.commands(["/motors"])
+    says.commands([])
+    assert log.lines == []

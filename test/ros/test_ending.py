@@ -27,7 +27,6 @@ STUCK_AT_EXIT = """
 import atexit, ctypes, sys
 from iwm_power_manager.ros import ending
 atexit.register(ctypes.PyDLL(None).pause)
-ending.LIMIT_S = 0.3
 sys.exit(ending.at_exit({code}))
 """
 
@@ -57,7 +56,6 @@ LEAVES_A_THREAD = """
 import sys, threading, types
 from iwm_power_manager import executables
 from iwm_power_manager.ros import ending
-ending.LIMIT_S = 0.3
 def main():
     threading.Thread(target=threading.Event().wait).start()
     return 3
@@ -184,7 +182,7 @@ import ctypes, sys
 import rclpy
 from iwm_power_manager.nodes import power_manager
 from iwm_power_manager.ros import ending
-assert ending.LIMIT_S < 5.0, "launch gives a node 5 s"
+assert 2 * ending.SHORT_S + ending.LIMIT_S < 5.0, "launch gives a node 5 s"
 rclpy.try_shutdown = lambda *_, **__: ctypes.PyDLL(None).pause()
 sys.exit(power_manager.main())
 """
@@ -204,3 +202,28 @@ def test_a_node_that_dds_does_not_let_go_ends_before_launch_loses_patience(compi
         process.kill()
         process.wait()
         bench.close()
+
+
+#: The same, however long leaving may take, while it compiles.
+COMPILING = """
+import ctypes, sys, threading
+import rclpy
+from iwm_power_manager.nodes import power_manager, preparation
+from iwm_power_manager.ros import ending
+ending.LIMIT_S = 600.0
+preparation.prepare = lambda _: print("compiling", flush=True) or threading.Event().wait()
+rclpy.try_shutdown = lambda *_, **__: ctypes.PyDLL(None).pause()
+sys.exit(power_manager.main())
+"""
+
+
+def test_a_node_that_compiles_owes_nothing_and_is_not_waited_for_long() -> None:
+    given = arguments({"policy_file": "", "strategy": "equal"}, {"__ns": f"/compiling_{os.getpid()}"})
+    process = subprocess.Popen([sys.executable, "-c", COMPILING, *given], stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None and process.stdout.readline() == "compiling\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60.0) == 0
+    finally:
+        process.kill()
+        process.communicate()

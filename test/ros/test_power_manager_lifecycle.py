@@ -6,6 +6,7 @@ from __future__ import annotations
 import signal
 
 import pytest
+from bench import TRANSITIONS
 
 from iwm_power_manager.ros import messages
 
@@ -100,9 +101,12 @@ def test_cleaned_up_it_leaves_the_topics_and_can_be_configured_again(bench) -> N
 
 
 @pytest.mark.parametrize("transition", ["activate", "deactivate", "cleanup"])
-def test_a_transition_that_does_not_exist_is_refused(bench, transition) -> None:
+def test_a_transition_that_does_not_exist_is_refused(pair, bench, transition) -> None:
     assert not bench.change_state(transition)
     assert bench.lifecycle_state() == "unconfigured"
+    line = f"{transition} ({TRANSITIONS[transition]}) is refused: the node is unconfigured, from where it can "
+    bench.spin_until(lambda: line in pair.running.text(), "the reason")
+    assert "configure (1), shutdown (5)" in pair.running.text().split(line)[1]
 
 
 @pytest.mark.parametrize(
