@@ -44,6 +44,8 @@ _ACCELERATION_OLDEST_S = 0.1
 _REFUSED_BY_ANOTHER = (Violation.TOO_FAST, Violation.STAMP_NOT_NEWER)
 #: Refused for its values.
 _OF_VALUES = (Violation.OUT_OF_RANGE, Violation.NOT_FINITE, Violation.AXLE_LOST, Violation.LENGTH)
+#: Refused for its time.
+_OF_STAMPS = (Violation.STAMP_TOO_OLD, Violation.STAMP_IN_FUTURE, Violation.LATE)
 #: No message is that long on its way; a stamp of 0 is that old.
 _OTHER_CLOCK_S, _UNSTAMPED_S = 1.0, 1e9
 #: Speeds that agree differ by no more than this, and this part of the largest.
@@ -135,7 +137,8 @@ class Tally:
     accepted_ns : time of the last accepted one: its stamp, or when it was received if it has none (None: none yet)
     violation : why the last message was dropped, or was accepted with a reservation
     describe : says more of a message whose values were refused; None: the value, and what is allowed
-    stamp_off_s : how far the last stamp that was judged lay from the clock
+    stamp : limits of stamps; None where they are not judged
+    stamp_off_s : how far the last stamp that was judged lay from the clock, or how long ago a demand was sent
     refused : the last value that was refused, and what it may be
     """
 
@@ -145,6 +148,7 @@ class Tally:
     accepted_ns: int | None = None
     violation: Violation = Violation.NONE
     describe: Callable[[], str] | None = None
+    stamp: StampLimits | None = None
     stamp_off_s: float = 0.0
     refused: tuple[float, ValueLimits] | None = None
 
@@ -153,12 +157,16 @@ class Tally:
         if self.violation is Violation.NONE:
             return ""
         more = self.described()
-        if self.violation in (Violation.STAMP_TOO_OLD, Violation.STAMP_IN_FUTURE) and self.stamp_off_s:
+        if self.violation in _OF_STAMPS and self.stamp_off_s:
             more = f"by {self.stamp_off_s:.3g} s"
             if self.stamp_off_s > _UNSTAMPED_S:
                 more += ", no stamp? then stamp: source; simulated time? then use_sim_time for both"
             elif self.stamp_off_s > _OTHER_CLOCK_S:
                 more += ", another clock? then stamp: source"
+            elif self.stamp and self.violation is Violation.STAMP_IN_FUTURE:
+                more += f"; allowed: stamp_future_s {self.stamp.future_s:g}"
+            elif self.stamp:
+                more += f"; allowed: stamp_oldest_s {self.stamp.oldest_s:g}"
         elif self.violation is Violation.TOO_FAST and self.refused:
             value, limits = self.refused
             more = f"{value:g}; allowed: a change of {min(limits.rise_per_s, limits.fall_per_s):g} a second"
@@ -214,7 +222,7 @@ class InputMonitor:
     def __init__(self, wheel_names: tuple[str, ...], limits: InputLimits) -> None:
         self._wheel_names = wheel_names
         self._limits = limits
-        self.tallies = {topic: Tally() for topic in (SPEED, WHEELS, DEMAND, BATTERY, FRICTION)}
+        self.tallies = {topic: Tally(stamp=limits.stamp) for topic in (SPEED, WHEELS, DEMAND, BATTERY, FRICTION)}
         self.tallies[WHEELS].describe = self._why_no_wheels
         self._last_wheels = JointReading(0, (), ())
         self.wheels_refused: Counter[tuple[str, WheelVerdict]] = Counter()
@@ -361,6 +369,7 @@ class InputMonitor:
         Its age begins `lag_s` earlier: it was put together from a part that is so much older.
         """
         tally = self.tallies[DEMAND]
+        tally.stamp_off_s = delay_s
         violation = Violation.LATE if delay_s > self._limits.demand_delay_s else Violation.NONE
         if violation is Violation.NONE:
             last = math.nan if tally.accepted_ns is None else self.demand_w
@@ -405,7 +414,8 @@ class InputMonitor:
     def _why_no_wheels(self) -> str:
         _, names, values = self._last_wheels
         if len(names) != len(values):
-            return f"{len(values)} values for {len(names)} wheels"
+            some = "; four sources, with an index each, take some of them"
+            return f"{len(values)} values for {len(names)} wheels" + some * (len(values) > len(names))
         lost = [(n, v) for n, v in zip(self._wheel_names, self.verdicts, strict=True) if v is not WheelVerdict.GOOD]
         words = ", ".join(f"{name} {verdict.name.lower().replace('_', ' ')}" for name, verdict in lost)
         absent = set(self._wheel_names).difference(names)

@@ -136,7 +136,9 @@ def _check_installed(file: Path, key: str, msgtype: str) -> None:
         types_of(msgtype)
     except (ImportError, BagError, ValueError):
         problem = f"{msgtype} is not installed here"
-        near = did_you_mean(spelled_like(msgtype, standard_types().fielddefs))
+        known = standard_types().fielddefs  # by the last word: most types have "_msgs/msg/" in common
+        words = spelled_like(msgtype.rpartition("/")[2], (name.rpartition("/")[2] for name in known))
+        near = did_you_mean([name for word in words for name in known if name.endswith(f"/{word}")][:3])
         allowed = "a type of a sourced workspace, such as std_msgs/msg/Float64" + near
         raise ConfigError(file, f"{key}.type", problem, allowed) from None
 

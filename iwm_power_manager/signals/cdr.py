@@ -407,21 +407,32 @@ class MessageWriter:
         return bytes(data)
 
 
-def blank(types: Types) -> Any:
-    """A message with zeros, empty texts and empty lists in it; arrays of fixed length full of zeros."""
+def blank(types: Types, path: str = "", length: int = 0) -> Any:
+    """A message with zeros, empty texts and empty lists in it; arrays of fixed length full of zeros.
+
+    Lists on the way of `path` are as long as its indices ask for, and one at its end as long as `length`.
+    """
     import numpy as np
     from rosbags.interfaces import Nodetype
 
-    def value(kind: Any, argument: Any) -> Any:
+    def value(kind: Any, argument: Any, steps: Sequence[str | int] | None) -> Any:
+        """Of a field; `steps` from there on, None beside the way."""
+
+        def beyond(step: str | int) -> Sequence[str | int] | None:
+            return steps[1:] if steps and steps[0] == step else None
+
         if kind == Nodetype.NAME:
-            return blank(types._replace(name=str(argument)))
+            fields = types.store.fielddefs[str(argument)][1]
+            return types.store.types[str(argument)](
+                **{name: value(kind, argument, beyond(name)) for name, (kind, argument) in fields}
+            )
         if kind == Nodetype.BASE:
             return "" if argument[0].endswith("string") else 0
         (item_kind, item), count = argument
-        count = count if kind == Nodetype.ARRAY else 0
+        if kind != Nodetype.ARRAY:
+            count = 0 if steps is None else int(steps[0]) + 1 if steps else length
         if item_kind == Nodetype.BASE and item[0] in _NUMBERS:
             return np.zeros(count, dtype=np.dtype("<" + _NUMBERS[item[0]]))
-        return [value(item_kind, item) for _ in range(count)]
+        return [value(item_kind, item, beyond(i)) for i in range(count)]
 
-    fields = types.store.fielddefs[types.name][1]
-    return types.store.types[types.name](**{name: value(*field) for name, field in fields})
+    return value(Nodetype.NAME, types.name, steps_of(path))

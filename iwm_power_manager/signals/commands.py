@@ -32,6 +32,8 @@ _WHEELS = len(WHEEL_NAMES)
 _UNITS = {"N m": 1.0}
 #: Largest factor, and one over the smallest.
 _MOST = 1e9
+#: Furthest place in a list that a command may have.
+_LAST = 999
 
 
 class Sink(NamedTuple):
@@ -207,6 +209,8 @@ def _writer(file: Path, sink: Sink, most_nm: float) -> MessageWriter:
             f"{sink.type} has no {wanted} {sink.field}",
             f"a field that is one {wanted}",
         )
+    if any(isinstance(step, int) and step > _LAST for step in steps_of(sink.field) or ()):
+        raise ConfigError(file, dotted(sink.key, "field"), f"{sink.field} is far back in a list", f"up to [{_LAST}]")
     writer = MessageWriter(types, _template(file, types, sink), sink.field)
     try:
         for sign in (-1.0, 1.0):
@@ -220,14 +224,9 @@ def _writer(file: Path, sink: Sink, most_nm: float) -> MessageWriter:
 
 def _template(file: Path, types: Types, sink: Sink) -> bytes:
     """A message as long as those that are sent, with names where it has such."""
-    import numpy as np
-
-    message = owner = blank(types)
-    *parents, last = steps_of(sink.field) or [""]
-    for step in parents:
+    message = owner = blank(types, sink.field, len(sink.wheels))
+    for step in (steps_of(sink.field) or [""])[:-1]:
         owner = owner[step] if isinstance(step, int) else getattr(owner, step)
-    if len(sink.wheels) > 1 and len(held := getattr(owner, str(last))) == 0:
-        setattr(owner, str(last), np.zeros(len(sink.wheels), dtype=held.dtype))
     if sink.names:
         if field_kind(types, names_path(sink.field)) != "texts":
             raise ConfigError(file, dotted(sink.key, "names"), f"{sink.type} has no field `name` beside {sink.field}")

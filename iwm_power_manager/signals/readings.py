@@ -487,10 +487,7 @@ def joint_state_reader(field: str) -> MessageReader[NamedValues]:
 
 def joint_state_writer(names: Sequence[str], field: str) -> MessageWriter:
     """Writer of JointStates that have the same names and fill the same field."""
-    import numpy as np
-
     types = types_of(JOINT_STATE)
-    message = blank(types)
+    message = blank(types, field, len(names))
     message.name = list(names)
-    setattr(message, field, np.zeros(len(names)))
     return MessageWriter(types, bytes(types.store.serialize_cdr(message, JOINT_STATE)), field)

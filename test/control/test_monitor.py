@@ -486,8 +486,9 @@ class TestWhatIsRefusedSaysWhy:
     @pytest.mark.parametrize(
         ("stamp_ns", "words"),
         [
-            (NOW - 200 * MS, "stamp too old: by 0.2 s"),
-            (NOW - 1000 * MS, "stamp too old: by 1 s"),
+            (NOW - 200 * MS, "stamp too old: by 0.2 s; allowed: stamp_oldest_s 0.1"),
+            (NOW - 1000 * MS, "stamp too old: by 1 s; allowed: stamp_oldest_s 0.1"),
+            (NOW + 50 * MS, "stamp in future: by 0.05 s; allowed: stamp_future_s 0.02"),
             (NOW - 5000 * MS, "stamp too old: by 5 s, another clock? then stamp: source"),
             (NOW + 5000 * MS, "stamp in future: by 5 s, another clock? then stamp: source"),
             (
@@ -499,6 +500,17 @@ class TestWhatIsRefusedSaysWhy:
     def test_a_stamp_by_how_far_it_is_off_and_what_that_may_mean(self, monitor, stamp_ns, words) -> None:
         monitor.take_speed(SpeedReading(stamp_ns, 10.0), self.NOW)
         assert monitor.tallies[SPEED].why() == words
+
+    @pytest.mark.parametrize(
+        ("delay_s", "words"),
+        [
+            (0.2, "late: by 0.2 s; allowed: stamp_oldest_s 0.1"),
+            (5.0, "late: by 5 s, another clock? then stamp: source"),
+        ],
+    )
+    def test_a_demand_that_comes_late_by_how_much(self, monitor, delay_s, words) -> None:
+        monitor.take_demand(1.0, delay_s, NOW)
+        assert monitor.tallies[DEMAND].why() == words
 
     def test_a_value_by_what_it_was_and_what_it_may_be(self, monitor) -> None:
         monitor.take_speed(SpeedReading(NOW, 61.0), NOW)
@@ -520,6 +532,11 @@ class TestWhatIsRefusedSaysWhy:
         ("values", "names", "words"),
         [
             ((1.0, 2.0, 3.0), NAMES, "length: 3 values for 4 wheels"),
+            (
+                (1.0,) * 6,
+                NAMES,
+                "length: 6 values for 4 wheels; four sources, with an index each, take some of them",
+            ),
             (
                 (math.nan, math.nan, 1.0, 900.0),
                 NAMES,

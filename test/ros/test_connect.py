@@ -15,6 +15,7 @@ from bench import Running, arguments
 from stack import JOINTS, NUMBER, NUMBERS, Stack, number, of_type
 
 from iwm_power_manager.exit_codes import BAD_INPUT
+from iwm_power_manager.ros import messages
 from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.tools.replay import main as replay
@@ -363,6 +364,72 @@ signals:
 """
 
 
+BACKWARDS = """
+signals:
+  speed: {topic: odom, type: nav_msgs/msg/Odometry, field: twist.twist.linear.x, unit: m/s, sign: -1}
+  wheel_speed:
+    - {topic: rpm, type: std_msgs/msg/Float32MultiArray, field: "data[2]", unit: rpm, offset: -8000}
+    - {topic: rpm, type: std_msgs/msg/Float32MultiArray, field: "data[3]", unit: rpm, offset: -8000, sign: -1}
+    - {topic: rpm, type: std_msgs/msg/Float32MultiArray, field: "data[0]", unit: rpm, offset: -8000}
+    - {topic: rpm, type: std_msgs/msg/Float32MultiArray, field: "data[1]", unit: rpm, offset: -8000, sign: -1}
+  accelerator_pedal: {topic: throttle, type: std_msgs/msg/Int8, field: data, unit: "%"}
+  brake_pedal: {topic: pressure_bar, type: std_msgs/msg/Float32, field: data, unit: "%", factor: 1.25}
+  soc: {topic: bms, type: sensor_msgs/msg/BatteryState, field: voltage, unit: "%", offset: -200}
+commands:
+  motor_torque:
+    - {topic: motor_0, type: std_msgs/msg/Float64MultiArray, field: "data[1]", unit: N m}
+    - {topic: motor_1, type: std_msgs/msg/Float64MultiArray, field: "data[1]", unit: N m, sign: -1}
+    - {topic: motor_2, type: std_msgs/msg/Float64MultiArray, field: "data[1]", unit: N m}
+    - {topic: motor_3, type: std_msgs/msg/Float64MultiArray, field: "data[1]", unit: N m, sign: -1}
+  friction_torque: {topic: brakes, type: trajectory_msgs/msg/JointTrajectory, field: "points[0].effort", unit: N m,
+                    sign: -1, order: [rear_left, rear_right, front_left, front_right]}
+"""
+
+
+def test_a_car_seen_from_behind_with_counts_bars_and_lists_in_lists_drives_after_its_sensors_came_back(
+    connect: Callable[..., Connected],
+) -> None:
+    """Right-hand motors turn the other way, the rear stands first, motors obey the second number of their array."""
+    counts, text = "std_msgs/msg/Float32MultiArray", "trajectory_msgs/msg/JointTrajectory"
+    sends = {"odom": ODOMETRY, "rpm": counts, "throttle": "std_msgs/msg/Int8", "pressure_bar": "std_msgs/msg/Float32"}
+    motors = [f"motor_{i}" for i in range(4)]
+    car = connect(BACKWARDS, sends | {"bms": BATTERY}, dict.fromkeys(motors, NUMBERS) | {"brakes": text})
+    braking = False
+
+    def inputs(stack: Stack) -> dict[str, Any]:
+        rpm = 5.0 / RADIUS_M * 30.0 / math.pi
+        return {
+            "odom": of_type(ODOMETRY, header__stamp=stack.stamp(), twist__twist__linear__x=-5.0),
+            "rpm": of_type(counts, data=[8000.0 + turn * rpm for turn in (1, -1, 1, -1)]),
+            "throttle": of_type("std_msgs/msg/Int8", data=0 if braking else 30),
+            "pressure_bar": of_type("std_msgs/msg/Float32", data=40.0 if braking else 0.0),
+            "bms": of_type(BATTERY, header__stamp=stack.stamp(), voltage=260.0, current=-3.0, percentage=math.nan),
+        }
+
+    def torques() -> list[float]:
+        heard = [car.stack.last(topic) for topic in motors]
+        assert all(len(message.data) == 2 for message in heard if message)
+        return [message.data[1] if message else 0.0 for message in heard]
+
+    def drives() -> bool:
+        front_left, front_right, rear_left, rear_right = torques()
+        return min(front_left, -front_right, rear_left, -rear_right) > 30.0
+
+    car.stack.drive(inputs, drives, "driving torque")
+    car.stack.drive(lambda _: {}, lambda: not any(torques()), "no torque without sensors")
+    for topic, kind in sends.items():
+        car.stack.node.destroy_publisher(car.stack.publishers[topic])
+        car.stack.publishers[topic] = car.stack.node.create_publisher(messages.message_class(kind), topic, 1)
+    car.stack.drive(inputs, drives, "driving torque again")
+    braking = True
+
+    def brakes() -> bool:
+        (point,) = car.stack.last("brakes").points
+        return len(point.effort) == 4 and min(point.effort) > 10.0 and torques()[0] < -10.0
+
+    car.stack.drive(inputs, brakes, "braking torque")
+
+
 def test_what_it_waits_for_names_the_topic_the_reason_and_the_remedy(connect: Callable[..., Connected]) -> None:
     """A speed of another type, two of four wheels, and a force in N where the file says kN."""
     sends = {"odom": ODOMETRY, "rpm_2": NUMBER} | dict.fromkeys(("rpm_0", "rpm_1", "force", "charge"), NUMBER)
@@ -402,6 +469,11 @@ def test_what_it_waits_for_names_the_topic_the_reason_and_the_remedy(connect: Ca
         (
             {"geometry_msgs/msg/Twist,": "my_msgs/msg/Speed,"},
             "signals.speed.type: my_msgs/msg/Speed is not installed here",
+        ),
+        (
+            {"geometry_msgs/msg/Twist,": "geometry_msg/msg/Twist,"},
+            "geometry_msg/msg/Twist is not installed here; allowed: a type of a sourced workspace, such as "
+            "std_msgs/msg/Float64; did you mean geometry_msgs/msg/Twist",
         ),
         ({"  soc:": "  sox:"}, "signals.sox: is an unknown key"),
         ({"friction_torque: none": "friction_torque: nothing"}, "commands.friction_torque"),

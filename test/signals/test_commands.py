@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rclpy.serialization import deserialize_message
@@ -112,6 +114,31 @@ def test_four_topics_carry_a_wheel_each_and_none_carries_nothing(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
+    ("msgtype", "field", "place"),
+    [
+        ("std_msgs/msg/Float64MultiArray", "data[2]", lambda found: found.data),
+        ("sensor_msgs/msg/JointState", "effort[0]", lambda found: found.effort),
+        ("trajectory_msgs/msg/JointTrajectory", "points[1].effort[2]", lambda found: found.points[1].effort),
+    ],
+)
+def test_a_wheel_may_have_a_place_in_a_list_that_is_no_longer_than_that(
+    tmp_path: Path, msgtype: str, field: str, place: Callable[[Any], Any]
+) -> None:
+    entries = [f'{{topic: t{i}, type: {msgtype}, field: "{field}", unit: N m}}' for i in range(4)]
+    written = writer(tmp_path, f"[{', '.join(entries)}]")[MOTOR](0, TORQUES)
+    found = [place(deserialize_message(data, messages.message_class(msgtype))) for _, data in written]
+    last = int(field[-2])
+    assert [list(one) for one in found] == [[0.0] * last + [torque] for torque in TORQUES]
+
+
+def test_an_array_may_stand_in_a_message_of_a_list(tmp_path: Path) -> None:
+    entry = '{topic: a, type: trajectory_msgs/msg/JointTrajectory, field: "points[0].effort", unit: N m}'
+    ((_, data),) = writer(tmp_path, entry)[MOTOR](0, TORQUES)
+    found = deserialize_message(data, messages.message_class("trajectory_msgs/msg/JointTrajectory"))
+    assert [list(point.effort) for point in found.points] == [list(TORQUES)]
+
+
+@pytest.mark.parametrize(
     ("motor", "problem"),
     [
         ("none", "commands.motor_torque"),
@@ -130,6 +157,10 @@ def test_four_topics_carry_a_wheel_each_and_none_carries_nothing(tmp_path: Path)
         (
             "{topic: a, type: std_msgs/msg/Float64MultiArray, field: data, unit: N m, names: [a, b, c, d]}",
             "has no field `name` beside data",
+        ),
+        (
+            "{topic: a, type: trajectory_msgs/msg/JointTrajectory, field: 'points[1000].effort', unit: N m}",
+            "field: points[1000].effort is far back in a list; allowed: up to [999]",
         ),
         ("[{topic: a, type: std_msgs/msg/Float64, field: data, unit: N m}]", "1 topics; allowed: one for all wheels"),
     ],
