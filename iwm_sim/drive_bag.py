@@ -68,8 +68,8 @@ def read_drive_bag(path: Path) -> DriveBag:
                 if not size:
                     signals, size = _layout(path, bag.topics[message.topic].type, message.data)
                 decisions.append(_positions(message.data, size)[signals])
-        if bag.damage:
-            raise BagError(bag.damage[0])
+        if problems := [*bag.damage, *bag.notes]:
+            raise BagError(problems[0])
     return DriveBag(dict(counts), stamps, np.array(decisions).reshape(-1, len(LAW_COLUMNS)))
 
 

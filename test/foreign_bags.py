@@ -7,6 +7,7 @@ import json
 import math
 import sqlite3
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -169,10 +170,42 @@ def record(content: Any) -> bytes:
 
 def announced(channels: Iterable[Channel] = CHANNELS) -> bytes:
     """Records of schemas and channels, numbered from 1 on."""
+    channels = tuple(channels)
+    return schema_records(channels) + channel_records(channels)
+
+
+def schema_records(channels: Iterable[Channel] = CHANNELS) -> bytes:
+    """Records of schemas, numbered from 1 on."""
     return b"".join(
         record(mcap.records.Schema(id=i, name=channel.type, encoding=channel.encoding, data=channel.text.encode()))
-        + record(mcap.records.Channel(i, channel.topic, channel.serialization, {}, i))
         for i, channel in enumerate(channels, 1)
+    )
+
+
+def channel_records(channels: Iterable[Channel] = CHANNELS) -> bytes:
+    """Records of channels, numbered from 1 on."""
+    return b"".join(
+        record(mcap.records.Channel(i, channel.topic, channel.serialization, {}, i))
+        for i, channel in enumerate(channels, 1)
+    )
+
+
+def statistics(entries: list[Entry]) -> bytes:
+    """The record of a summary that counts messages."""
+    counts = Counter(number + 1 for _, number, _ in entries)
+    times = [log_ns for log_ns, _, _ in entries]
+    return record(
+        mcap.records.Statistics(
+            attachment_count=0,
+            channel_count=len(counts),
+            channel_message_counts=counts,
+            chunk_count=1,
+            message_count=len(entries),
+            message_end_time=max(times),
+            message_start_time=min(times),
+            metadata_count=0,
+            schema_count=len(counts),
+        )
     )
 
 
@@ -190,12 +223,13 @@ def chunk(records: bytes, compression: str = "", packed: bytes | None = None) ->
     return record(mcap.records.Chunk(compression, content, START_NS, START_NS, 0, len(records)))
 
 
-def write_records(path: Path, *parts: bytes) -> Path:
-    """A whole MCAP file, without a summary, of such records."""
+def write_records(path: Path, *parts: bytes, summary: bytes = b"") -> Path:
+    """A whole MCAP file of such records."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    head = record(mcap.records.Header("ros2", "foreign"))
-    end = record(mcap.records.DataEnd(0)) + record(mcap.records.Footer(0, 0, 0))
-    path.write_bytes(b"".join([MCAP0_MAGIC, head, *parts, end, MCAP0_MAGIC]))
+    content = b"".join([MCAP0_MAGIC, record(mcap.records.Header("ros2", "foreign")), *parts])
+    content += record(mcap.records.DataEnd(0))
+    footer = record(mcap.records.Footer(len(content) if summary else 0, 0, 0))
+    path.write_bytes(content + summary + footer + MCAP0_MAGIC)
     return path
 
 
@@ -234,13 +268,15 @@ def write_bag(folder: Path, entries: Iterable[Entry], channels: Iterable[Channel
     return write_metadata(folder, channels)
 
 
-def write_sqlite(folder: Path, entries: Iterable[Entry], channels: Iterable[Channel] = CHANNELS) -> Path:
+def write_sqlite(
+    folder: Path, entries: Iterable[Entry], channels: Iterable[Channel] = CHANNELS, timestamps: str = "INTEGER"
+) -> Path:
     """A bag as Eloquent wrote it: no quality of service, no definitions, paths with the folder's name in front."""
     folder.mkdir()
     with sqlite3.connect(folder / "a_0.db3") as database:
         database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
         database.execute(
-            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB NOT NULL)"
+            f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp {timestamps}, data BLOB)"
         )
         for number, channel in enumerate(channels):
             database.execute("INSERT INTO topics VALUES(?, ?, ?, 'cdr')", (number, channel.topic, channel.type))

@@ -35,6 +35,8 @@ MESSAGE_OVERHEAD_BYTES = 250
 #: Records at the top of one file, and channels in it.
 MAX_RECORDS = 20_000_000
 MAX_CHANNELS = 10_000
+#: A clock that goes back by more, by the log times of one topic, was set; less is how late a message may come.
+SET_BACK_NS = 1_000_000_000
 #: Lines about what is wrong with one file.
 MAX_NOTES = 100
 #: `metadata.yaml`, the same text inside of a file, and one profile of quality of service.

@@ -26,7 +26,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from io import BytesIO
-from itertools import count
+from itertools import accumulate, count
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -231,9 +231,10 @@ def split(raw: bytes, definitions: Definitions) -> list[ChannelMessage]:
 
 
 class Piece(NamedTuple):
-    """A chunk, or a stretch of messages outside of chunks: its first log time, and where it is."""
+    """A chunk, or a stretch of messages outside of chunks: its first and last log time, and where it is."""
 
     start_ns: int
+    end_ns: int
     record: Record
 
 
@@ -255,6 +256,7 @@ class McapSource:
     information : what rosbag2 keeps inside of the file of its `metadata.yaml`; {} if that is nothing or unreadable
     custom_data : custom metadata inside of the file, our own recorder's or rosbag2's
     start_ns, end_ns : log times of the messages; 0 if there is none
+    set_back : the clock was set back while it was recorded: its log times are no order, and the file's order counts
 
     Raises
     ------
@@ -286,12 +288,12 @@ class McapSource:
         self.information = information_of(self.metadata.get("rosbag2", {}).get("serialized_metadata", ""))
         own = self.metadata.get(CUSTOM_METADATA, {})
         self.custom_data = text_values(self.information.get("custom_data")) | own
-        known = self.definitions.channels.keys()
-        if statistics is not None and known and statistics.channel_message_counts.keys() <= known:
+        if statistics is not None and self._all_defined(statistics):
             self.counts.update(statistics.channel_message_counts)
             self.start_ns, self.end_ns = statistics.message_start_time, statistics.message_end_time
         else:
             self._open_all()
+        self.set_back = self._was_set_back()
 
     # --- what the file is about -------------------------------------------------------------------------------------
 
@@ -320,8 +322,8 @@ class McapSource:
         for record in self.records():
             found = record.content
             if record.opcode == Opcode.CHUNK:
-                start_ns, _, size = _CHUNK_HEAD.unpack_from(self.data, record.body)
-                self._pieces.append(Piece(start_ns, record))
+                start_ns, end_ns, size = _CHUNK_HEAD.unpack_from(self.data, record.body)
+                self._pieces.append(Piece(start_ns, end_ns, record))
                 unpacked += size if size <= limits.MAX_CHUNK_BYTES else 0  # more is refused by itself
                 if unpacked > limits.MAX_CHUNK_BYTES + limits.MAX_RATIO * len(self.data):
                     self._too_much_at = min(self._too_much_at, record.start)
@@ -361,24 +363,48 @@ class McapSource:
 
     def _add_to_run(self, record: Record) -> None:
         """A message outside of chunks: the run it belongs to is read in one piece, like a chunk."""
+        log_time = start_ns = end_ns = _MESSAGE.unpack_from(self.data, record.start)[4]
         last = self._pieces[-1].record if self._pieces else None
         if last and last.opcode == Opcode.MESSAGE and last.end == record.start and last.end - last.start < _RUN_BYTES:
+            start_ns, end_ns, _ = self._pieces.pop()
             record = last._replace(end=record.end)
-            self._pieces.pop()
-        self._pieces.append(Piece(0, record))
+        self._pieces.append(Piece(min(start_ns, log_time), max(end_ns, log_time), record))
+
+    def _all_defined(self, statistics: Statistics) -> bool:
+        """Whether what was met outside of chunks defines all topics; the definitions may stand in chunks alone."""
+        definitions = self.definitions
+        known = definitions.channels.keys()
+        schemas = {channel.schema_id for channel in definitions.channels.values()} - {0}
+        return bool(
+            known >= statistics.channel_message_counts.keys() and known and definitions.schemas.keys() >= schemas
+        )
 
     def _open_all(self) -> None:
         """Look into every chunk: channels may be announced there and nowhere else, and its head may be wrong."""
         pieces, self._pieces = self._pieces, []
-        end_ns = 0
         for piece in pieces:
             messages = self.unpack(piece)
             self.counts.update(message[1] for message in messages)
             if messages:
                 times = [message[0] for message in messages]
-                self._pieces.append(Piece(min(times), piece.record))
-                end_ns = max(end_ns, *times)
-        self.start_ns, self.end_ns = min((piece.start_ns for piece in self._pieces), default=0), end_ns
+                self._pieces.append(Piece(min(times), max(times), piece.record))
+        self.start_ns = min((piece.start_ns for piece in self._pieces), default=0)
+        self.end_ns = max((piece.end_ns for piece in self._pieces), default=0)
+
+    def _was_set_back(self) -> bool:
+        """Whether the log times of a channel go back; where chunks follow each other in time, none is opened to see."""
+        filled = [piece for piece in self._pieces if piece.end_ns]  # one without messages has no times
+        ends = accumulate((piece.end_ns for piece in filled), max)
+        jumps = any(after.start_ns < end - limits.SET_BACK_NS for end, after in zip(ends, filled[1:], strict=False))
+        if not jumps and len(filled) != 1:
+            return False
+        newest: dict[int, int] = {}
+        for piece in filled:
+            for log_time, channel, *_ in self.unpack(piece):
+                if log_time < newest.setdefault(channel, log_time) - limits.SET_BACK_NS:
+                    return True
+                newest[channel] = log_time
+        return False
 
     def note(self, line: str) -> None:
         """Add a line to the damage, if there is room for another."""
@@ -389,10 +415,14 @@ class McapSource:
     # --- messages ---------------------------------------------------------------------------------------------------
 
     def messages(self) -> Iterator[ChannelMessage]:
-        """All messages in the order of their log times; equal times keep the order of the file.
+        """All messages in the order of their log times; equal times, and a clock set back, keep the order of the file.
 
         Memory: a chunk, and of those before it the messages that belong behind its first.
         """
+        if self.set_back:
+            for piece in self._pieces:
+                yield from self.unpack(piece)
+            return
         pieces = sorted(self._pieces, key=itemgetter(0))
         waiting: list[tuple[int, int, ChannelMessage]] = []
         order, size = count(), 0

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read any rosbag2 bag: MCAP or sqlite3, one file or many, compressed or not, whole or damaged. Needs no ROS.
 
-Messages come in the order of their log times. What cannot be read is described in `BagReader.damage`; it is never fatal
-as long as anything can be read. Nothing outside of the bag's folder is opened, and nothing but regular files.
+Messages come in the order of their log times; where the clock was set back while they were recorded, in that of the
+recording. What cannot be read is described in `BagReader.damage`; it is never fatal as long as anything can be read.
+Nothing outside of the bag's folder is opened, and nothing but regular files.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any, NamedTuple, Self
 
 from iwm_power_manager.bags.limits import ZSTD_MAGIC, check_exists, decompress, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_source import MAGIC, McapSource
-from iwm_power_manager.bags.metadata import Topic, read_metadata, text_values
+from iwm_power_manager.bags.metadata import METADATA_FILE, Topic, read_metadata, text_values
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError
 
@@ -28,6 +29,7 @@ Source = McapSource | SqliteSource
 SUFFIXES = (".mcap", ".db3")
 COMPRESSED_SUFFIX = ".zstd"
 _SQLITE_MAGIC = b"SQLite format 3\0"
+MISNAMED = "is compressed, which its name does not say"
 
 
 class Message(NamedTuple):
@@ -62,6 +64,7 @@ class BagReader:
     counts : messages by topic
     custom_data : custom metadata
     start_ns, end_ns : log times the bag spans (0, 0 if it is empty)
+    notes : what is unusual and costs nothing, a line each
 
     Raises
     ------
@@ -74,10 +77,12 @@ class BagReader:
         check_exists(self.path)
         self._stack = ExitStack()
         self._damage: list[str] = []
+        self.notes: list[str] = []
         self.sources: list[Source] = []
         try:
             self.information, problem = read_metadata(self.path) if os.path.isdir(self.path) else ({}, "")
-            self._damage += [problem] if problem else []
+            there = os.path.lexists(self.path / METADATA_FILE)
+            (self._damage if there else self.notes).extend([problem] if problem else [])
             self._open_all()
         except BaseException:
             self.close()
@@ -109,9 +114,10 @@ class BagReader:
         return self._damage + [f"{source.path}: {line}" for source in self.sources for line in source.damage]
 
     def messages(self) -> Iterator[Message]:
-        """All messages in the order of their log times; equal times keep the order of the recording."""
-        sources = sorted(self.sources, key=lambda source: source.start_ns)
-        overlap = any(after.start_ns <= before.end_ns for before, after in pairwise(sources))
+        """All messages in the order of log times; equal times, or a clock that was set back, keep that of recording."""
+        set_back = any(source.set_back for source in self.sources)
+        sources = self.sources if set_back else sorted(self.sources, key=lambda source: source.start_ns)
+        overlap = not set_back and any(after.start_ns <= before.end_ns for before, after in pairwise(sources))
         streams = [self._messages_of(source) for source in sources]
         if overlap:
             yield from heapq.merge(*streams, key=lambda message: message.log_time_ns)
@@ -148,7 +154,9 @@ class BagReader:
             if topic.definition or names[number] not in self.topics:
                 self.topics[names[number]] = topic
             if names[number] != topic.name:
-                source.note(f"{topic.name} has more than one definition: each message is read by its own")
+                self.notes.append(f"{topic.name} has more than one definition: each message is read by its own")
+        if source.set_back:
+            self.notes.append(f"{source.path}: the clock was set back meanwhile: it is read in the order of recording")
         self.custom_data = source.custom_data | self.custom_data
 
     def _name(self, topic: Topic) -> str:
@@ -165,7 +173,8 @@ class BagReader:
         for name in self._file_names():
             try:
                 opened, problem = opened_file(name, self._stack, self.path if self.path != name else None)
-                self._damage += [f"{name}: {problem}"] if problem else []
+                harmless = problem == MISNAMED
+                (self.notes if harmless else self._damage).extend([f"{name}: {problem}"] if problem else [])
                 self.sources.append(open_source(opened, name, self._stack))
             except BagError as error:
                 problems.append(str(error))
@@ -185,7 +194,7 @@ class BagReader:
             there = data_files(self.path)
             known = {*present, *(name for name in there if recovered(name) in present)}
             left_out = [name for name in there if name not in known and _begins_as_data(name, self.path)]
-            self._damage += [f"{name}: is not in metadata.yaml and left out" for name in left_out]
+            self.notes += [f"{name}: is not in metadata.yaml and left out" for name in left_out]
         return present
 
 
@@ -230,7 +239,7 @@ def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside
         return path, ""
     where = path.parent if beside else None
     copied = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_bag_", dir=where))) / path.stem
-    return copied, decompress_file(path, copied) or ("" if named else "is compressed, which its name does not say")
+    return copied, decompress_file(path, copied) or ("" if named else MISNAMED)
 
 
 def journals(path: Path) -> list[Path]:

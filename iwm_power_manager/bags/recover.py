@@ -217,7 +217,9 @@ class _File:
         opened, problem = _opened(path, stack)
         self.seen = _Seen(reader.open_source(opened, path, stack), gaps)
         self.is_sqlite = isinstance(self.seen.source, SqliteSource)
-        self.problem = problem or "; ".join(self.seen.source.damage[:3])
+        homeless = self.seen.counts.keys() - self.seen.topics.keys()
+        unknown = ["holds messages of channels that are nowhere announced"] if homeless else []
+        self.problem = problem or "; ".join([*self.seen.source.damage[:3], *unknown])
         self.report = FileRecovery(path.name, False, self.seen.count, "")
 
     def rebuild(self) -> None:

@@ -36,6 +36,18 @@ _TABLES = """
 """
 _BY_TIME = "SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, rowid"
 _AS_RECORDED = "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"
+#: Times are whole numbers of nanoseconds, or the same with a decimal point.
+_TIMED = "typeof(timestamp) IN ('integer', 'real') AND timestamp BETWEEN 0 AND 9223372036854775807"
+_COUNTS = f"""
+    SELECT topic_id, count(*), min(timestamp), max(timestamp), total(typeof(data) <> 'blob')
+    FROM messages WHERE {_TIMED} GROUP BY topic_id
+"""  # noqa: S608 - constants
+_SET_BACK = f"""
+    SELECT 1 FROM (
+        SELECT timestamp - lag(timestamp) OVER (PARTITION BY topic_id ORDER BY rowid) AS step
+        FROM messages WHERE {_TIMED}
+    ) WHERE step < -{limits.SET_BACK_NS} LIMIT 1
+"""  # noqa: S608 - constants
 
 
 class SqliteSource:
@@ -72,21 +84,22 @@ class SqliteSource:
             raise BagError(f"{path}: is no readable sqlite3 bag: {_one_line(error)}") from None
         except KeyError as error:
             raise BagError(f"{path}: is no rosbag2 sqlite3 bag: its topics have no {error}") from None
+        self.set_back = False
         self._count()
-        self._reader = self._rosbags_reader(stack) if self._plain and not self.damage else None
+        self._reader = self._rosbags_reader(stack) if self._plain and not (self.damage or self.set_back) else None
 
     def topics(self) -> dict[int, Topic]:
         """The topic of each id."""
         return self._topics
 
     def messages(self) -> Iterator[ChannelMessage]:
-        """All messages in the order of their log times, of a damaged file in the order of recording."""
+        """All messages in the order of log times, or of recording: of a damaged file, or if the clock was set back."""
         bad = sum(count for number, count in self.counts.items() if number not in self._topics)
         try:
             for number, log_time, data in self._rows():
                 if number in self._topics:
-                    if (type(log_time), type(data)) == (int, bytes) and log_time >= 0:
-                        yield log_time, number, data, log_time, 0
+                    if type(log_time) in (int, float) and 0 <= log_time < 2**63 and type(data) is bytes:
+                        yield (time_ns := int(log_time)), number, data, time_ns, 0
                     else:
                         bad += 1
         except (sqlite3.Error, apsw.Error, OverflowError, MemoryError) as error:
@@ -99,7 +112,7 @@ class SqliteSource:
             for connection, log_time, data in self._reader.messages(self._reader.connections):
                 yield connection.id, log_time, data
         else:
-            yield from self._database.execute(_AS_RECORDED if self.damage else _BY_TIME)
+            yield from self._database.execute(_AS_RECORDED if self.damage or self.set_back else _BY_TIME)
 
     def _rosbags_reader(self, stack: ExitStack) -> Sqlite3Reader | None:
         """The reader of rosbags, if it takes this file: its queries end after so many instructions, too."""
@@ -152,14 +165,12 @@ class SqliteSource:
             (problem,) = self._database.execute("PRAGMA quick_check(1)").fetchone()
             if problem != "ok":
                 self.note(f"is damaged: {' '.join(problem.split())}")
-            for number, count, start_ns, end_ns, odd in self._database.execute(
-                "SELECT topic_id, count(*), min(timestamp), max(timestamp), total(typeof(data) <> 'blob') FROM messages"
-                " WHERE typeof(timestamp) = 'integer' GROUP BY topic_id"
-            ):
+            for number, count, start_ns, end_ns, odd in self._database.execute(_COUNTS):
                 self._plain = self._plain and not odd
-                self.start_ns = min(self.start_ns, start_ns) if self.counts else start_ns
-                self.end_ns = max(self.end_ns, end_ns)
+                self.start_ns = min(self.start_ns, int(start_ns)) if self.counts else int(start_ns)
+                self.end_ns = max(self.end_ns, int(end_ns))
                 self.counts[number] = count
+            self.set_back = self._database.execute(_SET_BACK).fetchone() is not None
         except sqlite3.Error as error:
             self.note(f"is damaged: {_one_line(error)}")
             self.counts.clear()

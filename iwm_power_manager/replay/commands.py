@@ -7,6 +7,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection, Sequence
 
+from iwm_power_manager.bags.limits import SET_BACK_NS
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.replay.compare import TopicComparer, TopicComparison
@@ -63,6 +64,7 @@ class RecordedCommand:
         self._sent: deque[tuple[int, int]] = deque(maxlen=_RECENT)
         self._waiting: list[tuple[int, int, NamedValues]] = []
         self._alone = 0
+        self._newest_ns = 0
 
     def _made(
         self, stamp_ns: int, values: tuple[float | tuple[float, ...], ...], names: tuple[str, ...]
@@ -76,6 +78,7 @@ class RecordedCommand:
         if self.stamped:
             self._comparer.recorded(found.stamp_ns, message.log_time_ns, found.names, found.values)
             return
+        self._follow(message.publish_time_ns)
         place = bisect_left(self._sent, (message.publish_time_ns, -1))
         if place < len(self._sent):
             self._comparer.recorded(self._sent[place][1], message.log_time_ns, found.names, found.values)
@@ -85,6 +88,7 @@ class RecordedCommand:
     def recomputed(self, step: ReplayedStep) -> None:
         """Take a replayed step."""
         if not self.stamped:
+            self._follow(step.publish_time_ns)
             self._sent.append((step.publish_time_ns, step.stamp_ns))
             due = [one for one in self._waiting if one[0] <= step.publish_time_ns]
             self._waiting = self._waiting[len(due) :]
@@ -100,6 +104,13 @@ class RecordedCommand:
             ((_, data),) = self._write(step.stamp_ns, torques)
             values = self._read(data).values
         self._comparer.recomputed(step.stamp_ns, step.log_time_ns, self._names, values)
+
+    def _follow(self, publish_time_ns: int) -> None:
+        """Forget the steps of before the clock was set back, in whose times nothing can be found any more."""
+        if publish_time_ns < self._newest_ns - SET_BACK_NS:
+            self._sent.clear()
+            self._newest_ns = publish_time_ns
+        self._newest_ns = max(self._newest_ns, publish_time_ns)
 
     def result(self) -> TopicComparison:
         """What has been found so far."""

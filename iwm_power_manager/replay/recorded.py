@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iwm_power_manager.bags.limits import SET_BACK_NS
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.control.inputs import ValueLimits, Violation, check_value
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
@@ -284,12 +285,14 @@ def read_signal(
                 rows += [] if math.isnan(speed) else [(log_time_ns, stamp, reading.power_w, speed)]
             else:
                 wrong += isinstance(reading, SpeedReading | readings.DemandReading)
-        damage = [*reader.damage, *stream.problems, *filter(None, [standing])]
+        damage = [*reader.notes, *reader.damage, *stream.problems, *filter(None, [standing])]
     if not rows:
         raise BagError(f"{bag}: holds no power demand with a speed before it")
     log_times, stamps, demands, speeds = map(np.array, zip(*rows, strict=True))
-    time_ns = _times(log_times, stamps)
+    time_ns = _continued(_times(log_times, stamps), np.diff(log_times) < -SET_BACK_NS)
     keep = _advancing(time_ns)
+    if behind := np.count_nonzero(time_ns < np.maximum.accumulate(time_ns)):
+        damage.append(f"{behind} of {time_ns.size} demands are left out: their stamps are behind those before them")
     if 2 * keep.size < time_ns.size:
         damage.append(f"only {keep.size} of {time_ns.size} demands have a time of their own: the others are left out")
     time_s = (time_ns[keep] - time_ns[keep[0]]) * 1e-9
@@ -325,6 +328,13 @@ def check_signals(reader: BagReader, mapping: SignalMapping, stream: SignalStrea
     if lacking:
         problem = f"holds no topic that {mapping.path} maps to {lacking[0]}; it holds {held}"
         raise BagError(f"{reader.path}: {problem}; other topics are named by a signals file: --mapping")
+
+
+def _continued(time_ns: NDArray[np.int64], was_set: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Times as of a clock that was not set back: where it was, one more step of the usual length."""
+    steps = np.diff(time_ns)
+    steps[was_set] = np.median(steps[~was_set]) if not was_set.all() else 0
+    return np.concatenate((time_ns[:1], time_ns[0] + np.cumsum(steps)))
 
 
 def _advancing(time_ns: NDArray[np.int64]) -> NDArray[np.intp]:

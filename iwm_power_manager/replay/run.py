@@ -111,7 +111,7 @@ class Replay:
         compared = [*(command.result() for command in self._commands.values()), self._state_comparer.result()]
         return replace(
             self._report,
-            notes=[*self._report.notes, *self._source.notes(), *self._other_unit()],
+            notes=[*self._bag.notes, *self._report.notes, *self._source.notes(), *self._other_unit()],
             dropped=self._source.not_believed(),
             damage=self._bag.damage,
             comparison=[found for found in compared if found.has_record],

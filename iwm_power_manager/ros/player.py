@@ -163,7 +163,7 @@ class _Player:
         for publisher in self._publishers.values():
             publisher.wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
         print(f"{self._bag.path}: {self._sent} messages of {len(self._publishers)} topics published")
-        for line in dict.fromkeys(self._jumps):
+        for line in dict.fromkeys([*self._bag.notes, *self._jumps]):
             print(f"  {one_line(line)}")
         for line in self._bag.damage:
             print(f"  damaged: {one_line(line)}")

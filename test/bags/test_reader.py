@@ -15,6 +15,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
+import foreign_bags as foreign
 from bags_helpers import FLOAT64, float64, topic
 from disk_helpers import private_folder
 from iwm_power_manager.bags.metadata import parse_qos
@@ -93,7 +94,8 @@ def test_many_files_read_as_one_in_the_order_of_log_times(tmp_path: Path) -> Non
     (tmp_path / "bag" / "metadata.yaml").unlink()  # the order then comes from the names: 9 before 10
     with BagReader(tmp_path / "bag") as reader:
         assert [m.log_time_ns for m in reader.messages()] == list(range(600))
-        assert reader.damage == [f"{tmp_path / 'bag'}: has no metadata.yaml: the recorder did not finish"]
+        assert reader.damage == []
+        assert reader.notes == [f"{tmp_path / 'bag'}: has no metadata.yaml: the recorder did not finish"]
 
 
 def test_overlapping_chunks_and_files_are_merged_by_log_time(tmp_path: Path) -> None:
@@ -106,6 +108,67 @@ def test_overlapping_chunks_and_files_are_merged_by_log_time(tmp_path: Path) -> 
             if i == 1000:
                 bag.split()
     assert [entry[0] for entry in contents(tmp_path / "bag")] == list(range(2000))
+
+
+@pytest.mark.parametrize("storage", ["chunks", "one chunk", "no chunks", "two files", "cut off", "sqlite3"])
+def test_a_bag_whose_clock_was_set_back_is_read_in_the_order_of_recording(tmp_path: Path, storage: str) -> None:
+    drive = foreign.drive()
+    shifted = [(log_ns - 3600 * 10**9 * (i >= 150), number, data) for i, (log_ns, number, data) in enumerate(drive)]
+    path = tmp_path / "bag"
+    if storage == "sqlite3":
+        foreign.write_sqlite(path, shifted)
+    elif storage == "two files":
+        foreign.write_mcap(path / "a_0.mcap", shifted[:200])
+        foreign.write_mcap(path / "a_1.mcap", shifted[200:])
+        foreign.write_metadata(path, relative_file_paths=["a_0.mcap", "a_1.mcap"])
+    elif storage == "no chunks":
+        records = foreign.announced() + foreign.message_records(shifted)
+        foreign.write_records(path / "a_0.mcap", records)
+        foreign.write_metadata(path)
+    else:
+        foreign.write_bag(path, shifted, chunk_bytes=10**9 if storage == "one chunk" else 4096)
+    if storage == "cut off":
+        content = (path / "a_0.mcap").read_bytes()
+        (path / "a_0.mcap").write_bytes(content[:-100])
+    with BagReader(path) as reader:
+        assert [(m.log_time_ns, m.data) for m in reader.messages()] == [(log_ns, data) for log_ns, _, data in shifted]
+        (note,) = reader.notes
+        assert note.endswith("the clock was set back meanwhile: it is read in the order of recording")
+
+
+def test_topics_written_one_after_the_other_are_read_by_their_log_times(tmp_path: Path) -> None:
+    by_topic = sorted(foreign.drive(), key=lambda entry: entry[1])
+    for path in (foreign.write_bag(tmp_path / "mcap", by_topic), foreign.write_sqlite(tmp_path / "sqlite3", by_topic)):
+        with BagReader(path) as reader:
+            times = [message.log_time_ns for message in reader.messages()]
+            assert times == sorted(times)
+            assert reader.notes == []
+
+
+def test_times_with_a_decimal_point_are_times(tmp_path: Path) -> None:
+    entries = [(log_ns // 256 * 256, number, data) for log_ns, number, data in foreign.drive(20)]
+    path = foreign.write_sqlite(tmp_path / "bag", entries, timestamps="REAL")
+    with BagReader(path) as reader:
+        assert [m.log_time_ns for m in reader.messages()] == [log_ns for log_ns, _, _ in entries]
+        assert (reader.start_ns, reader.counts.total(), reader.damage) == (entries[0][0], 60, [])
+
+
+@pytest.mark.parametrize("announcing", ["summary", "chunk behind", "channels in the summary, schemas in a chunk"])
+def test_definitions_behind_the_messages_that_need_them_are_found(tmp_path: Path, announcing: str) -> None:
+    first, rest = (foreign.message_records(part) for part in (foreign.drive()[:150], foreign.drive()[150:]))
+    schemas, channels = foreign.schema_records(), foreign.channel_records()
+    body, summary = {
+        "summary": (foreign.chunk(first + rest), schemas + channels),
+        "chunk behind": (foreign.chunk(first) + foreign.chunk(schemas + channels + rest), b""),
+        "channels in the summary, schemas in a chunk": (foreign.chunk(schemas + channels + first + rest), channels),
+    }[announcing]
+    path = foreign.write_records(tmp_path / "a.mcap", body, summary=summary + foreign.statistics(foreign.drive()))
+    with BagReader(path) as reader:
+        assert sum(1 for _ in reader.messages()) == 300
+        assert {name: topic.definition for name, topic in reader.topics.items()} == {
+            channel.topic: channel.text for channel in foreign.CHANNELS
+        }
+        assert reader.damage == []
 
 
 def test_equal_log_times_keep_the_order_of_the_recording(make_bag: Callable[..., Path]) -> None:
@@ -256,7 +319,8 @@ def test_a_data_file_that_metadata_does_not_list_is_said_to_be_left_out(make_bag
     path = make_bag([("/a", i, 0.0) for i in range(10)])
     shutil.copy(path / "bag_0.mcap", path / "bag_1.mcap")
     with BagReader(path) as reader:
-        assert reader.damage == [f"{path / 'bag_1.mcap'}: is not in metadata.yaml and left out"]
+        assert reader.damage == []
+        assert reader.notes == [f"{path / 'bag_1.mcap'}: is not in metadata.yaml and left out"]
         assert len(list(reader.messages())) == 10
 
 

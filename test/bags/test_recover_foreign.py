@@ -304,6 +304,14 @@ def test_a_channel_that_is_announced_anew_as_another_is_said_and_becomes_another
         assert (reader.counts["/demand"], reader.counts["/other"]) == (10, 10)
 
 
+def test_messages_of_channels_that_are_nowhere_announced_get_a_topic(tmp_path: Path) -> None:
+    path = foreign.write_records(tmp_path / "a.mcap", foreign.chunk(foreign.message_records(foreign.drive(10))))
+    assert "holds messages of channels that are nowhere announced" in recover(path).files[0].damage
+    assert len(messages(path)) == 30
+    with BagReader(path) as reader:
+        assert set(reader.topics) == {f"/recovered/channel_{i}" for i in (1, 2, 3)}
+
+
 def test_a_second_recovery_keeps_the_original_of_the_first(tmp_path: Path) -> None:
     path = foreign.write_mcap(tmp_path / "bag" / "a_0.mcap", entries(), CHANNELS, chunk_bytes=2000)
     originals = []

@@ -146,6 +146,35 @@ def test_a_bag_of_before_a_signal_was_added_is_replayed(drive: Path, tmp_path: P
     assert main([str(tmp_path / "old"), "--compare"]) == DONE
 
 
+def test_commands_without_a_stamp_find_their_steps_also_where_the_clock_was_set_back(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    read = joint_state_reader("effort")
+    hour_ns = 3600 * 10**9
+    with BagReader(drive) as old, BagWriter(tmp_path / "bag", custom_data=old.custom_data) as new:
+        numbers = {name: new.add_topic(found) for name, found in old.topics.items() if "torque" not in name}
+        torques = [new.add_topic(topic(f"/torque_{wheel}")) for wheel in range(4)]
+        for message in old.messages():
+            back_ns = hour_ns if message.log_time_ns < old.start_ns + COUNT // 2 * ScriptedDrive.DT_NS else 0
+            sent = [(numbers.get(message.topic), message.data)]
+            if "torque" in message.topic:
+                values = read(message.data).values
+                sent = [(n, float64(v * s)) for n, v, s in zip(torques, values, (1, -1, 1, -1), strict=True)]
+            for number, data in sent:
+                times = message.log_time_ns + back_ns, data, message.publish_time_ns + back_ns
+                new.write(number, *times, message.sequence)
+    mapping = tmp_path / "mapping.yaml"
+    four, standard = (share_path(f"config/signals/{name}.yaml").read_text() for name in ("four_topics", "standard"))
+    brakes = standard[standard.index("  friction_torque:") :]
+    mapping.write_text(four.replace("  friction_torque: none\n", brakes))
+    assert main([str(tmp_path / "bag"), "--compare", "--mapping", str(mapping)]) == DONE
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[1:3] for line in lines if line.startswith("  /") and "clock" not in line] == [
+        [str(COUNT), "0"]
+    ] * 6
+    assert not [line for line in lines if "time(s) steps before" in line]
+
+
 @pytest.mark.parametrize("name", ["/splitter/state", "/cars/left/splitter/state", "/cars/left/power_manager/state"])
 def test_the_state_of_a_node_of_any_name_is_found(
     drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
