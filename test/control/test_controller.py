@@ -400,6 +400,31 @@ def test_until_something_is_commanded_every_brake_counts_in_full(drive) -> None:
     assert drive.controller.brake_gain == drive.controller.state.motion.brake_gain
 
 
+class TestFriction:
+    @staticmethod
+    def slipping(drive: Drive, steps: int) -> list[float]:
+        """Friction of each step while the wheels slip with hardly any torque, as on ice."""
+        return [drive.run(1, speed=15.0, wheels=(13.2 / RADIUS,) * 4, demand=-6000.0)["friction"] for _ in range(steps)]
+
+    def test_the_policy_is_that_of_the_friction_that_was_estimated_in_the_step_before(self, drive) -> None:
+        controller, asked = drive.controller, []
+        controller.table_of = lambda friction: asked.append(friction) or empty_table(rule=(friction, 0.5, 0.0, 0.5))
+        controller.settings = controller.settings._replace(friction_prior=0.8)
+        drive.run(60, speed=15.0)
+        for _ in range(100):
+            assumed = controller.state.friction.assumed
+            [used] = self.slipping(drive, 1)
+            assert used == controller.friction == assumed
+            assert controller.policy.rule[0] == used
+        assert used < 0.4
+        assert len(asked) < 60, "a policy is only asked for when the friction is another"
+
+    def test_without_policies_of_other_frictions_the_one_given_stays(self, drive) -> None:
+        drive.run(60, speed=15.0)
+        assert set(self.slipping(drive, 100)) == {0.9}
+        assert drive.controller.state.friction.assumed < 0.4
+
+
 class TestFaultOfTheLaw:
     @pytest.mark.parametrize("torque", [math.nan, 1e6])
     def test_what_no_motor_may_be_given_never_leaves(self, drive, monkeypatch, torque) -> None:

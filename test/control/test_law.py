@@ -919,6 +919,30 @@ def test_a_car_that_rolls_back_is_braked_whatever_its_wheels_do():
         assert sum(command.friction_torque_nm) <= 0.8 * sum(rolling.friction_torque_nm)
 
 
+@given(SHARES, st.floats(0.5, 8.0), st.floats(-8e3, -500.0), st.sampled_from([1.0, -1.0]))
+def test_a_car_that_rolls_back_is_braked_by_both_axles_alike_whatever_the_split(share, speed, demand, direction):
+    one_sided = default_settings("preview")
+    table = TABLE._replace(schedule=TABLE.schedule[:1] * 0.0 + share)
+
+    def after_a_second(sign):
+        state = initial_state()
+        for _ in range(100):
+            command, state = law.step(moving(sign * speed, demand, direction), state, one_sided, CAR, table)
+        return command
+
+    def by_wheel(command, sign):
+        both = zip(command.motor_torque_nm, command.friction_torque_nm, strict=True)
+        return [sign * motor + friction for motor, friction in both]
+
+    back = after_a_second(-direction)
+    torques = by_wheel(back, -direction)
+    assert back.front_share == 0.5
+    assert torques == pytest.approx([torques[0]] * 4, rel=1e-6)
+    assert torques[0] < 0.0
+    ahead = after_a_second(direction)
+    assert ahead.front_share == pytest.approx(share), "where slip is controlled the split is the strategy's"
+
+
 def test_reverse_drives_backwards_and_no_faster_than_it_may():
     command, _ = settled(moving(0.0, 1500.0, -1.0))
     assert max(command.motor_torque_nm) < -30.0
