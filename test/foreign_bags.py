@@ -9,6 +9,7 @@ import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,9 @@ import mcap.records
 import yaml
 from mcap.data_stream import RecordBuilder
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.errors import BagError
 
 COUNT = 100
 PERIOD_NS = 20_000_000
@@ -235,13 +239,17 @@ def write_records(path: Path, *parts: bytes, summary: bytes = b"") -> Path:
 
 def write_metadata(folder: Path, channels: Iterable[Channel] = CHANNELS, **changes: Any) -> Path:
     """A `metadata.yaml` of rosbag2 version 5 for one file, with changes."""
+    counts: Counter[str] = Counter()
+    with suppress(BagError), BagReader(folder) as reader:
+        for name, count in reader.counts.items():
+            counts[reader.topics[name].name] += count
     information = {
         "version": 5,
         "storage_identifier": "mcap",
         "relative_file_paths": ["a_0.mcap"],
         "duration": {"nanoseconds": 1},
         "starting_time": {"nanoseconds_since_epoch": START_NS},
-        "message_count": 1,
+        "message_count": counts.total(),
         "topics_with_message_count": [
             {
                 "topic_metadata": {
@@ -250,7 +258,7 @@ def write_metadata(folder: Path, channels: Iterable[Channel] = CHANNELS, **chang
                     "serialization_format": channel.serialization,
                     "offered_qos_profiles": "",
                 },
-                "message_count": 1,
+                "message_count": counts[channel.topic],
             }
             for channel in channels
         ],

@@ -47,6 +47,8 @@ SQLITE_INSTRUCTIONS = 100_000_000
 SQLITE_INSTRUCTIONS_PER_BYTE = 100
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+#: How a compressed message begins: CDR begins otherwise, so no metadata is needed.
+PACKED = {ZSTD_MAGIC: "zstd", b"\x04\x22\x4d\x18": "lz4"}
 
 
 def check_exists(path: Path) -> None:

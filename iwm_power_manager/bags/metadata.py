@@ -178,6 +178,14 @@ _KINDS = {
 }
 
 
+def miscounted(information: Mapping[str, Any], topics: Mapping[str, int]) -> bool:
+    """Whether a `metadata.yaml` without another problem states other numbers of messages than the files hold."""
+    entries = information["topics_with_message_count"]
+    listed = {entry["topic_metadata"]["name"]: entry["message_count"] for entry in entries}
+    wrong = any(listed.get(name, 0) != count for name, count in topics.items())
+    return wrong or bool(information["message_count"] != sum(topics.values()))
+
+
 def _wrong_key(content: object, kind: Any, key: str) -> str:
     """The first key that is missing or holds something of another kind; "" for none."""
     if isinstance(kind, dict):

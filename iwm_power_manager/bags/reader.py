@@ -18,9 +18,9 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
-from iwm_power_manager.bags.limits import ZSTD_MAGIC, check_exists, decompress, decompress_file, regular_file
+from iwm_power_manager.bags.limits import PACKED, ZSTD_MAGIC, check_exists, decompress, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_source import MAGIC, McapSource
-from iwm_power_manager.bags.metadata import METADATA_FILE, Topic, read_metadata, text_values
+from iwm_power_manager.bags.metadata import METADATA_FILE, Topic, miscounted, read_metadata, text_values
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError
 
@@ -94,6 +94,13 @@ class BagReader:
         self.custom_data = text_values(self.information.get("custom_data"))
         for source in self.sources:
             self._take(source)
+        if not (self.damage or not self.information):
+            held: Counter[str] = Counter()
+            for source in self.sources:
+                for number, topic in source.topics().items():
+                    held[topic.name] += source.counts[number]
+            if miscounted(self.information, held):
+                self.notes.append(f"{self.path}: metadata.yaml miscounts the messages: {held.total()} are there")
         filled = [source for source in self.sources if source.counts.total()]
         self.start_ns = min((source.start_ns for source in filled), default=0)
         self.end_ns = max((source.end_ns for source in filled), default=0)
@@ -133,9 +140,9 @@ class BagReader:
             if name is None:
                 homeless += 1
                 continue
-            if data[:4] == ZSTD_MAGIC:  # compression mode "message"; CDR begins otherwise, so no metadata is needed
+            if data[:4] in PACKED:  # compression mode "message"
                 try:
-                    data = decompress("zstd", data)
+                    data = decompress(PACKED[data[:4]], data)
                 except BagError:
                     unpackable += 1  # stays as it is; decoders refuse and count it
             yield Message(log_time, name, data, publish_time, sequence)

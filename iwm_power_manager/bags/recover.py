@@ -25,9 +25,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from iwm_power_manager.bags import mcap_source, reader
-from iwm_power_manager.bags.limits import ZSTD_MAGIC, check_exists, regular_file
+from iwm_power_manager.bags.limits import PACKED, check_exists, regular_file
 from iwm_power_manager.bags.mcap_file import McapFile
-from iwm_power_manager.bags.metadata import FileSpan, Topic, bag_information, read_metadata, text_values
+from iwm_power_manager.bags.metadata import FileSpan, Topic, bag_information, miscounted, read_metadata, text_values
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
 from iwm_power_manager.errors import BagError
@@ -135,6 +135,7 @@ def recover(path: Path | str) -> Recovery:
             raise BagError(f"{left_out[0].damage}; nothing to recover")
         information, problem = read_metadata(path) if folder else ({}, "none")
         fits = not (problem or left_out) and reader.listed_files(information).keys() == {name.name for name in names}
+        fits = fits and not miscounted(information, _topic_counts(files))
         sqlite = all(file.is_sqlite and not file.problem for file in files)
         for file in files:
             if file.problem or (file.is_sqlite and not sqlite) or (file.is_compressed and not fits):
@@ -152,6 +153,14 @@ def recover(path: Path | str) -> Recovery:
             max(file.seen.end_ns for file in files),
             stale,
         )
+
+
+def _topic_counts(files: Iterable[_File]) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    for file in files:
+        for number, topic in file.seen.topics.items():
+            counts[topic.name] += file.seen.counts[number]
+    return counts
 
 
 def _names(path: Path) -> list[Path]:
@@ -194,13 +203,13 @@ class _Seen:
         self.source = source
         self.topics = source.topics()
         self.counts: Counter[int] = Counter()
-        self.compressed = False
+        self.compression = ""
         self.start_ns, self.end_ns = 2**64, 0
         own = _is_own(source)  # other recorders count something else
         for log_time, channel, data, _, sequence in source.messages():
             self.counts[channel] += 1
             self.start_ns, self.end_ns = min(self.start_ns, log_time), max(self.end_ns, log_time)
-            self.compressed = self.compressed or data[:4] == ZSTD_MAGIC
+            self.compression = self.compression or PACKED.get(data[:4], "")
             if sequence and own and channel in self.topics:
                 gaps.take(self.topics[channel].name, sequence)
         self.count = self.counts.total()
@@ -217,9 +226,12 @@ class _File:
         opened, problem = _opened(path, stack)
         self.seen = _Seen(reader.open_source(opened, path, stack), gaps)
         self.is_sqlite = isinstance(self.seen.source, SqliteSource)
-        homeless = self.seen.counts.keys() - self.seen.topics.keys()
-        unknown = ["holds messages of channels that are nowhere announced"] if homeless else []
-        self.problem = problem or "; ".join([*self.seen.source.damage[:3], *unknown])
+        found = self.seen.source.damage[:3]
+        if self.seen.counts.keys() - self.seen.topics.keys():
+            found.append("holds messages of channels that are nowhere announced")
+        elif not found and +self.seen.counts != +self.seen.source.counts:
+            found.append(f"says of itself that it holds {self.seen.source.counts.total()} messages")
+        self.problem = problem or "; ".join(found)
         self.report = FileRecovery(path.name, False, self.seen.count, "")
 
     def rebuild(self) -> None:
@@ -362,7 +374,7 @@ class _Copy:
 def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Mapping[str, object]) -> None:
     """`metadata.yaml` of the whole bag, with what the old one or the files know of it."""
     topics: dict[str, Topic] = {}
-    counts: Counter[str] = Counter()
+    counts = _topic_counts(files)
     custom_data: dict[str, str] = {}
     distro = str(recorded.get("ros_distro") or "")
     for file in files:
@@ -371,9 +383,8 @@ def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Ma
         if isinstance(source, mcap_source.McapSource):  # "" is this one
             known = source.information.get("ros_distro") or source.metadata.get("rosbag2", {}).get("ROS_DISTRO")
             distro = distro or str(known or ("" if _is_own(source) else "unknown"))
-        for number, topic in file.seen.topics.items():
+        for topic in file.seen.topics.values():
             topics.setdefault(topic.name, topic)
-            counts[topic.name] += file.seen.counts[number]
     information = bag_information(
         storage,
         [
@@ -384,6 +395,6 @@ def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Ma
         [(topic, counts[name]) for name, topic in topics.items()],
         custom_data | text_values(recorded.get("custom_data")),
         distro=distro,
-        compression="zstd" if any(file.seen.compressed for file in files) else "",
+        compression=next((file.seen.compression for file in files if file.seen.compression), ""),
     )
     write_metadata(folder, information)

@@ -94,14 +94,14 @@ class SqliteSource:
 
     def messages(self) -> Iterator[ChannelMessage]:
         """All messages in the order of log times, or of recording: of a damaged file, or if the clock was set back."""
-        bad = sum(count for number, count in self.counts.items() if number not in self._topics)
+        bad = 0
         try:
             for number, log_time, data in self._rows():
-                if number in self._topics:
-                    if type(log_time) in (int, float) and 0 <= log_time < 2**63 and type(data) is bytes:
-                        yield (time_ns := int(log_time)), number, data, time_ns, 0
-                    else:
-                        bad += 1
+                timed = type(log_time) in (int, float) and 0 <= log_time < 2**63
+                if timed and type(data) is bytes and type(number) is int:
+                    yield (time_ns := int(log_time)), number, data, time_ns, 0
+                else:
+                    bad += 1
         except (sqlite3.Error, apsw.Error, OverflowError, MemoryError) as error:
             self.note(f"is not readable to its end: {_one_line(error)}")
         if bad:
@@ -166,7 +166,7 @@ class SqliteSource:
             if problem != "ok":
                 self.note(f"is damaged: {' '.join(problem.split())}")
             for number, count, start_ns, end_ns, odd in self._database.execute(_COUNTS):
-                self._plain = self._plain and not odd
+                self._plain = self._plain and not odd and number in self._topics
                 self.start_ns = min(self.start_ns, int(start_ns)) if self.counts else int(start_ns)
                 self.end_ns = max(self.end_ns, int(end_ns))
                 self.counts[number] = count

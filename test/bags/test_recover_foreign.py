@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -302,6 +303,62 @@ def test_a_channel_that_is_announced_anew_as_another_is_said_and_becomes_another
     with BagReader(path) as reader:
         assert reader.damage == []
         assert (reader.counts["/demand"], reader.counts["/other"]) == (10, 10)
+
+
+@pytest.mark.parametrize("wrong", ["in all", "of a topic", "topic that is not there"])
+def test_wrong_counts_in_metadata_are_said_and_made_right(tmp_path: Path, wrong: str) -> None:
+    folder = foreign.write_bag(tmp_path / "bag", foreign.drive(10))
+    listed = information(folder)
+    topics = listed["topics_with_message_count"]
+    if wrong == "in all":
+        listed["message_count"] = 77
+    elif wrong == "of a topic":
+        topics[0]["message_count"], topics[1]["message_count"] = 5, 15
+    else:
+        del topics[2]
+    foreign.write_metadata(folder, **{key: listed[key] for key in ("message_count", "topics_with_message_count")})
+    with BagReader(folder) as reader:
+        assert reader.notes == [f"{folder}: metadata.yaml miscounts the messages: 30 are there"]
+        assert reader.damage == []
+    assert recover(folder).metadata_written
+    listed = information(folder)
+    assert listed["message_count"] == 30
+    assert [topic["message_count"] for topic in listed["topics_with_message_count"]] == [10, 10, 10]
+    with BagReader(folder) as reader:
+        assert (reader.notes, reader.damage) == ([], [])
+
+
+def test_a_file_whose_summary_miscounts_is_rebuilt(tmp_path: Path) -> None:
+    drive = foreign.drive(10)
+    body = foreign.announced() + foreign.chunk(foreign.message_records(drive))
+    path = foreign.write_records(
+        tmp_path / "a.mcap", body, summary=foreign.announced() + foreign.statistics(drive[:12])
+    )
+    assert recover(path).files[0].damage == "says of itself that it holds 12 messages"
+    with BagReader(path) as reader:
+        assert reader.counts.total() == sum(1 for _ in reader.messages()) == 30
+
+
+def test_rows_of_topics_that_a_database_lacks_get_a_topic(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(10))
+    with sqlite3.connect(folder / "a_0.db3") as database:
+        database.execute("DELETE FROM topics WHERE id = 1")
+    database.close()
+    assert "nowhere announced" in recover(folder).files[0].damage
+    assert Counter(message.topic for message in messages(folder)) == {
+        "/car/speed": 10,
+        "/recovered/channel_1": 10,
+        "/joint_states": 10,
+    }
+
+
+@pytest.mark.parametrize("packer", [zstandard.compress, lz4.frame.compress], ids=["zstd", "lz4"])
+def test_compressed_messages_are_read_and_stay_compressed(tmp_path: Path, packer: Callable[[bytes], bytes]) -> None:
+    drive = foreign.drive(10)
+    path = foreign.write_mcap(tmp_path / "bag" / "a_0.mcap", [(t, n, packer(data)) for t, n, data in drive])
+    assert [message.data for message in messages(path)] == [data for _, _, data in drive]
+    recover(path.parent)
+    assert information(path.parent)["compression_format"] == ("zstd" if packer is zstandard.compress else "lz4")
 
 
 def test_messages_of_channels_that_are_nowhere_announced_get_a_topic(tmp_path: Path) -> None:
