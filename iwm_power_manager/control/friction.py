@@ -218,8 +218,7 @@ def estimate(
         else:
             d, right_rear = _wheel(d, wheels[3], w[3], speed_mps, rear_n, dt_s, settings, rear)
     left = right = _side(before.left, a, c, left_front, left_rear, dt_s, settings, front)
-    alike = a == b and c == d and before.left == before.right
-    if not (alike and left_front == right_front and left_rear == right_rear):
+    if not (a == b and c == d and before.left == before.right):
         right = _side(before.right, b, d, right_front, right_rear, dt_s, settings, front)
     lower = min(left.friction, right.friction)
     assumed = before.assumed
