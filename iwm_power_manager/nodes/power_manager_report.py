@@ -18,14 +18,32 @@ from iwm_power_manager.ros import diagnostics
 
 #: Fewer steps since the last report say neither whether a sensor is believed nor whether torque is cut for long.
 _FEW_STEPS = 5
-#: Driving power that is asked for in earnest; the part of it that is as good as none; the part of steps that counts.
-_ASKED_W, _NONE, _MOSTLY = 1e3, 0.05, 0.9
+#: Driving power that is asked for in earnest, and as a force, which near standstill makes little power; the part of it
+#: that is as good as none; the part of steps that counts.
+_ASKED_W, _ASKED_N, _NONE, _MOSTLY = 1e3, 500.0, 0.05, 0.9
+#: Slower, a car may roll back on a slope; and what it gains in a second against its motors then.
+_ROLLS_MPS, _GAINS_MPS = 1.5, 0.2
 
 
 def is_cut(command: Command, motor_factor: float, asked_w: float) -> bool:
     """Whether power to drive is asked for and as good as none is given, although no input is missing."""
     given_w = command.front_power_w + command.rear_power_w
-    return motor_factor == 1.0 and asked_w > _ASKED_W and abs(given_w) < _NONE * asked_w
+    earnest_w = min(_ASKED_W, _ASKED_N * max(abs(command.speed_mps), 1.0))
+    return motor_factor == 1.0 and asked_w > earnest_w and abs(given_w) < _NONE * asked_w
+
+
+def is_against(command: Command, asked_w: float) -> bool:
+    """Whether the car moves against motors that drive it."""
+    motors_nm = sum(command.motor_torque_nm)
+    return asked_w > 0.0 and abs(command.speed_mps) > _ROLLS_MPS and command.speed_mps * motors_nm < 0.0
+
+
+def against_in_words(command: Command) -> str:
+    """What a car that moves against its motors may be wired like."""
+    return (
+        f"goes faster and faster, {command.speed_mps:.3g} m/s, against {sum(command.motor_torque_nm):.3g} N m of its "
+        "motors: right sign of the motor_torque command, of speed and wheel_speed?"
+    )
 
 
 def cut_in_words(controller: Controller) -> str:
@@ -69,8 +87,9 @@ class PowerManagerReport:
         self._activity: Counter[str] = Counter()
         self._steps = 0
         self._doubted: Counter[int] = Counter()
-        self._cut_steps = 0
-        self._cut = self._apart = ""
+        self._cut_steps = self._against_steps = 0
+        self._from_mps = 0.0
+        self._cut = self._apart = self._against = ""
         self.doubts: list[str] = []
 
     def note_step(
@@ -82,6 +101,7 @@ class PowerManagerReport:
         doubted = command.doubted & ~missing
         self._loop.add(period_s, execution_s)
         self._steps += 1
+        self._against_steps += is_against(command, asked_w)
         self._cut_steps += is_cut(command, supervision.motor_factor, asked_w)
         self._doubted.update(number for number in range(5) if doubted & 1 << number)
         if command.gate != GATE_NONE:
@@ -111,6 +131,11 @@ class PowerManagerReport:
         command = controller.command if controller else None
         if controller and self._steps >= _FEW_STEPS:  # the same words as long as it lasts
             self._cut = (self._cut or cut_in_words(controller)) if self._cut_steps > _MOSTLY * self._steps else ""
+        if command and self._steps >= _FEW_STEPS:
+            gained = abs(command.speed_mps) > abs(self._from_mps) + _GAINS_MPS
+            against = self._against_steps > _MOSTLY * self._steps and (gained or bool(self._against))
+            self._against = (self._against or against_in_words(command)) if against else ""
+            self._from_mps = command.speed_mps
         statuses.append(
             diagnostics.control_status(
                 lifecycle,
@@ -120,7 +145,7 @@ class PowerManagerReport:
                 self._activity,
                 values["strategy"],
                 self._car,
-                self._cut,
+                self._cut or self._against,
             )
         )
         if lifecycle == "active" and controller:
@@ -140,14 +165,14 @@ class PowerManagerReport:
             )
             if self._steps >= _FEW_STEPS:
                 self.doubts = [sensors.message] if sensors.level != diagnostics.OK else []
-                self.doubts += [self._cut] if self._cut else []
+                self.doubts += [words for words in (self._cut, self._against) if words]
             statuses.append(sensors)
             statuses.append(diagnostics.motors_status(controller.actuators, self._wheel_names))
             statuses.append(diagnostics.brakes_status(controller.brake_gain, self._wheel_names))
             statuses.append(self._loop.report(self._rate_hz, values))
         self._activity.clear()
         self._doubted.clear()
-        self._steps = self._cut_steps = 0
+        self._steps = self._cut_steps = self._against_steps = 0
         return diagnostics.to_message(now_ns, self._node_name, [*statuses, *extra])
 
 

@@ -242,7 +242,7 @@ def sensors_status(
     }
     contradicted = [name for number, name in enumerate(names) if 2 * doubted_steps.get(number, 0) > steps]
     why = apart if names[-1] in contradicted or len(contradicted) == len(wheel_names) else ""
-    problem = f"{', '.join(contradicted)} not believed: {why or 'contradicts the others; right unit and scale?'}"
+    problem = f"{', '.join(contradicted)} not believed: {why or 'contradicts the others; right unit, sign and scale?'}"
     if agree and contradicted == names:
         problem = "vehicle_speed and wheels agree, but not with the motion before: car, bench or bag started over? "
         problem += "then deactivate and activate this node as well"

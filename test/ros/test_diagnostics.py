@@ -22,7 +22,7 @@ from iwm_power_manager.control.supervision import (
     STALE_WHEELS,
     Supervision,
 )
-from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport, is_cut
+from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport, is_against, is_cut
 from iwm_power_manager.ros.diagnostics import (
     ERROR,
     OK,
@@ -181,7 +181,7 @@ def test_sensors_that_agree_with_each_other_alone_are_not_put_down_to_a_unit() -
     all_five = dict.fromkeys(range(5), 100)
     assert "started over? then deactivate" in sensors_status(all_five, 100, wheels, agree=True).message
     for doubted, agree in ((all_five, False), (dict.fromkeys(range(4), 100), True)):
-        assert "right unit and scale?" in sensors_status(doubted, 100, wheels, agree=agree).message
+        assert "right unit, sign and scale?" in sensors_status(doubted, 100, wheels, agree=agree).message
 
 
 def test_the_message_carries_stamp_names_levels_and_values() -> None:
@@ -231,6 +231,27 @@ def test_a_brake_that_gives_less_than_it_is_told_is_named():
 def test_only_driving_asked_for_in_earnest_and_with_all_inputs_there_counts_as_cut(given_w, motor_factor, asked_w, cut):
     command = command_of((0.0,) * len(DECIDED_NAMES))._replace(front_power_w=0.5 * given_w, rear_power_w=0.5 * given_w)
     assert is_cut(command, motor_factor, asked_w) is cut
+
+
+@pytest.mark.parametrize(("speed_mps", "cut"), [(0.0, True), (1.2, True), (5.0, False)])
+def test_near_standstill_a_force_is_asked_for_and_the_power_is_small(speed_mps, cut):
+    """800 N at rest are 800 W."""
+    assert is_cut(command_of((0.0,) * len(DECIDED_NAMES))._replace(speed_mps=speed_mps), 1.0, 800.0) is cut
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "motor_nm", "asked_w", "against"),
+    [
+        (-3.0, 50.0, 5e3, True),
+        (3.0, -50.0, 5e3, True),  # in reverse
+        (3.0, 50.0, 5e3, False),
+        (-1.0, 50.0, 5e3, False),  # may roll back on a slope
+        (3.0, -50.0, -5e3, False),  # brakes
+    ],
+)
+def test_a_car_that_moves_against_motors_that_drive_it(speed_mps, motor_nm, asked_w, against):
+    command = command_of((0.0,) * len(DECIDED_NAMES))._replace(speed_mps=speed_mps, motor_torque_nm=(motor_nm,) * 4)
+    assert is_against(command, asked_w) is against
 
 
 @pytest.mark.parametrize(

@@ -299,6 +299,25 @@ def test_power_that_a_limit_leaves_nothing_of_is_named_with_the_limit(start_own)
     bench.drive(lambda: "over: " in said_with(pair, said), "that it is over", demand=0.0, soc=0.008, speed=0.0)
 
 
+@pytest.mark.parametrize(("gains_mps2", "told"), [(-2.0, True), (2.0, False)])
+def test_a_car_that_goes_faster_and_faster_against_its_motors_is_told(start_own, gains_mps2: float, told: bool) -> None:
+    """Motors that turn the other way, or speed and wheels both of the wrong sign: what is asked for runs away."""
+    pair = start_own({"missed_periods": 10, "own_gap_s": 1.0})
+    bench = pair.bench
+    bench.connect()
+    bench.drive(lambda: bench.mode() == 1, "normal operation", speed=0.0, demand=0.0)
+    said = "N m of its motors: right sign of the motor_torque command, of speed and wheel_speed?"
+    step, period_s = 0, 0.01
+    while step < 1000 and not said_with(pair, said):
+        step += 1
+        due_s = time.monotonic() + period_s
+        bench.send(speed=gains_mps2 * step * period_s, demand=3000.0)
+        while (left_s := due_s - time.monotonic()) > 0.0:
+            bench.executor.spin_once(timeout_sec=left_s)
+    assert bool(said_with(pair, said)) is told
+    assert any(said in status.message for array in bench.diagnostics for status in array.status) is told
+
+
 def said_with(pair, text: str) -> str:
     """Lines of the node's log with that text."""
     return "\n".join(line for line in pair.running.text().splitlines() if text in line)
