@@ -115,7 +115,7 @@ def read_log(
     ConfigError
         Nothing usable, a column that is not there, a text that is no number, units that cannot be told.
     """
-    table = read_table(path, separator, decimal)
+    table = _with_units(read_table(path, separator, decimal))
     line, header = table.rows[0]
     columns = {
         "time": _column(table, header, "time", time, r"time|stamp|\bt(?![a-z0-9])|zeit"),
@@ -161,6 +161,17 @@ def read_log(
         problem = f"{header[columns['grade']]} reaches {np.max(np.abs(arrays['grade'])):g}: percent or degrees?"
         raise ConfigError(path, "", problem, f"rise over run, -{MAX_GRADE:g} to {MAX_GRADE:g}")
     return _in_si(path, arrays, header, columns, "clock" if clock else time_unit, speed_unit, said)
+
+
+def _with_units(table: Table) -> Table:
+    """A table whose header names the units, where they stood in a line of their own below it."""
+    (line, header), units = table.rows[0], table.rows[1][1] if len(table.rows) > 1 else []
+    words = [unit.strip("[]() ") for unit in units]
+    known = any(_named(f"[{word}]", names) for word in words if word for names in (_TIME_NAMES, _UNIT_NAMES))
+    if not known or any(character.isdigit() for word in words for character in word):
+        return table
+    named = [f"{name} [{word}]" if word else name for name, word in zip(header, words, strict=False)]
+    return table._replace(rows=[(line, named + header[len(words) :]), *table.rows[2:]])
 
 
 def _rising(path: Path | str, time: FloatArray, clock: bool, said: list[str]) -> NDArray[np.bool_]:

@@ -207,6 +207,15 @@ class _StrictLoader(yaml.SafeLoader):
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        try:
+            return super().construct_object(node, deep)
+        except yaml.YAMLError:
+            raise
+        except Exception:  # noqa: BLE001 - PyYAML's constructors fail in many ways: !!bool maybe is a KeyError
+            problem = f"{str(node.value)[:MAX_NUMBER_LENGTH]!r} is no {node.tag.rpartition(':')[2]}"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+
     def number(self, node: yaml.ScalarNode) -> float | int:
         """A number of decimal digits."""
         text = str(self.construct_scalar(node))
@@ -256,7 +265,7 @@ def read_yaml(path: Path | str) -> dict[str, Any]:
         line = "".join(text.split("\n")[mark.line : mark.line + 1]) if mark else ""
         hint = "; quote a text with [ ]" if _BARE_INDEX.search(line) else ""
         raise ConfigError(path, where, " ".join((error.problem or "is no YAML").split()) + hint) from None
-    except Exception as error:  # noqa: BLE001 - PyYAML's constructors fail in many ways: !!bool maybe is a KeyError
+    except Exception as error:  # noqa: BLE001 - characters that no YAML has, and what else PyYAML fails at
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(path, "", f"is no YAML: {reason}") from None
     if not isinstance(content, dict):

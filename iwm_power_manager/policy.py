@@ -372,6 +372,15 @@ def _other_version(version: Any, metadata: Any, path: Path | str) -> str:
     )
 
 
+#: Costs that are added and compared must not overflow; no car has so much energy.
+_RANGES = (
+    ("front_share", 0.0, 1.0),
+    ("cost_j", -1e15, 1e15),
+    ("dearer_cost_j", -1e15, 1e15),
+    ("demand_steps", 0.0, 1e15),
+)
+
+
 def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, checksum: str, path: Path | str) -> Policy:
     """Build the policy; the checksum is right, so what is inconsistent now was written by another program."""
     try:
@@ -391,8 +400,9 @@ def _policy_from(arrays: Mapping[str, NDArray[np.float64]], metadata: Any, check
                 raise PolicyError(f"{path}: {name} has shape {arrays[name].shape}, its axes say {shape}")
             if not np.all(np.isfinite(arrays[name])):
                 raise PolicyError(f"{path}: {name} holds a value that is not finite")
-        if np.min(arrays["front_share"]) < 0.0 or np.max(arrays["front_share"]) > 1.0:
-            raise PolicyError(f"{path}: front_share holds a value outside 0 to 1")
+        for name, low, high in _RANGES:
+            if np.any((arrays[name] < low) | (arrays[name] > high)):
+                raise PolicyError(f"{path}: {name} holds a value outside {low:g} to {high:g}")
         probability, by_speed = arrays["demand_probability"], arrays["demand_by_speed"]
         for name, rows in (("demand_probability", probability[None]), ("demand_by_speed", by_speed)):
             if np.any(rows < 0.0) or np.any(np.abs(rows.sum(axis=2) - 1.0) > 1e-9):

@@ -16,6 +16,8 @@ SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " ", "bar": 
 MAX_ROWS = 2_000_000
 MAX_COLUMNS = 1000
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+([eE][-+]?[0-9]+)?")
+#: What Excel writes and reads before the header.
+_STATED = re.compile(r"\ufeff?sep=([;,|\t])\s*")
 _THOUSANDS = re.compile(r"[-+]?[0-9]{1,3}(\.[0-9]{3})+(,[0-9]+)?")
 
 
@@ -44,7 +46,8 @@ def read_table(path: Path | str, separator: str = "auto", decimal: str = "auto")
 
     Parameters
     ----------
-    separator : a name of `SEPARATORS`, or auto: what splits most lines into equally many columns
+    separator : a name of `SEPARATORS`, or auto: what a line `sep=;` before the header says, else what splits most
+        lines into equally many columns
     decimal : point, comma, or auto: comma if a cell looks like one and commas separate nothing
 
     Raises
@@ -59,9 +62,15 @@ def read_table(path: Path | str, separator: str = "auto", decimal: str = "auto")
     ]
     if not lines:
         raise ConfigError(path, "", "is empty")
+    stated = _STATED.fullmatch(lines[0][1]) if len(lines) > 1 else None
+    if stated:
+        del lines[0]
     if len(lines) > MAX_ROWS:
         raise ConfigError(path, "", f"has {len(lines)} rows", f"<= {MAX_ROWS}")
-    mark = SEPARATORS[separator] if separator != "auto" else _separator([line for _, line in lines[:50]], decimal)
+    if separator != "auto":
+        mark = SEPARATORS[separator]
+    else:
+        mark = stated[1] if stated else _separator([line for _, line in lines[:50]], decimal)
     rows = []
     for number, line in lines:
         if len(line) > MAX_LINE_LENGTH:

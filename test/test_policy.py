@@ -294,6 +294,8 @@ def test_metadata_that_cannot_be_right_is_refused_even_with_a_right_checksum(con
     [
         ("cost_j", np.full((3, 3, 3, 2, 3), np.nan), "cost_j holds a value that is not finite"),
         ("front_share", np.full((3, 3, 3, 2, 3), 1.5), "front_share holds a value outside 0 to 1"),
+        ("cost_j", np.full((3, 3, 3, 2, 3), 1e308), "cost_j holds a value outside -1e+15 to 1e+15"),
+        ("demand_steps", np.full(3, -1.0), "demand_steps holds a value outside 0 to 1e+15"),
         ("demand_probability", np.eye(3) * 0.9, "a row of demand_probability is no distribution"),
         ("demand_steps", np.zeros(2), "demand_steps has shape (2,)"),
         ("cost_j", np.zeros((3, 3, 3, 2, 3), np.float32), "cost_j holds float32, not float64"),

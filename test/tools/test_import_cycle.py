@@ -64,6 +64,17 @@ def test_semicolons_decimal_commas_clocks_and_empty_cells_are_read(tmp_path, cap
     assert json.loads((tmp_path / "n.json").read_text())["speed_unit"] == "km/h"
 
 
+@pytest.mark.parametrize("units", ["s;km/h", "[s];[km/h]", "(s);(km/h)"])
+def test_units_in_a_line_of_their_own_and_a_stated_separator_are_read(tmp_path, capsys, units):
+    log = tmp_path / "log.csv"
+    log.write_text(f"sep=;\nzeit;v\n{units}\n" + "".join(f"{t},5;{3.6 * t:.1f}\n".replace(".", ",") for t in range(10)))
+    code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv")
+    assert code == 0
+    assert "speed in km/h, as the column's name says" in out
+    assert "time in s, as the column's name says" in out
+    np.testing.assert_allclose(load_cycle(tmp_path / "trip.csv").speed_mps, np.arange(10.0), atol=0.03)
+
+
 def test_a_column_of_time_that_is_empty_is_the_last_choice(tmp_path, capsys):
     rows = [("-", t, 3.6 * t) for t in range(10)]
     log = log_of(tmp_path / "log.csv", ("GPS Time", "Device Time", "Speed (km/h)"), rows)
