@@ -106,9 +106,11 @@ class Outputs:
             self.publish(write(now_ns, _ZERO))
 
     def wait(self) -> None:
-        """Wait a moment for those who obey to have the last command."""
+        """Wait a moment, the same for all topics, for those who obey to have the last command."""
+        until_s = time.monotonic() + _ACKNOWLEDGE_S
         for topic in self.topics:
-            self._publishers[topic].wait_for_all_acked(Duration(seconds=_ACKNOWLEDGE_S))
+            left_s = max(until_s - time.monotonic(), 0.0)
+            self._publishers[topic].wait_for_all_acked(Duration(seconds=left_s))
 
     def close(self) -> None:
         """Drop the publishers."""

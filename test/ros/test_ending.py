@@ -8,9 +8,12 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 from bench import Bench, arguments
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
 
 from iwm_power_manager.ros import ending, realtime
 
@@ -202,6 +205,22 @@ def test_a_node_that_dds_does_not_let_go_ends_before_launch_loses_patience(compi
         process.kill()
         process.wait()
         bench.close()
+
+
+def test_those_who_do_not_answer_are_waited_for_together(node, monkeypatch) -> None:
+    """Cars with a topic for each motor and brake have eight, and what the node still has to write comes after."""
+    waited_s: list[float] = []
+
+    def wait(_: Publisher, timeout: Duration) -> bool:
+        waited_s.append(timeout.nanoseconds * 1e-9)
+        time.sleep(waited_s[-1])
+        return False
+
+    monkeypatch.setattr(Publisher, "wait_for_all_acked", wait)
+    assert node.start()
+    node.stop()
+    assert len(waited_s) == 2
+    assert sum(waited_s) <= 0.2
 
 
 #: The same, however long leaving may take, while it compiles.
