@@ -8,7 +8,8 @@ The torque the law may count on is `gain` times what it commands; a motor that d
 
 Reports are only judged once some motor has been seen to follow its commands: a car that fills the field with zeros does
 not report, nor does one all of whose motors seem to be stuck or reversed. What else was found stays until the next
-activation, except a weak motor that follows again for `recover_s`.
+activation, except a weak motor that follows again for `recover_s`, and four that seem dead until one follows: their
+reports may be dead instead, so that driving is still tried.
 
 Pure functions over numbers; one call a step for each motor.
 """
@@ -100,6 +101,12 @@ class ActuatorState(NamedTuple):
     reporting: bool = False
 
     @property
+    def all_dead(self) -> bool:
+        """Whether no motor seems to give anything: one supply for all, or the reports."""
+        a, b, c, d = self.motors
+        return MotorVerdict.DEAD is a.verdict is b.verdict is c.verdict is d.verdict
+
+    @property
     def gains(self) -> Wheels:
         """Part of a commanded torque that arrives, motor by motor."""
         a, b, c, d = self.motors
@@ -136,9 +143,11 @@ def judge(state: ActuatorState, reported_nm: Wheels, dt_s: float, limits: Actuat
         return state
     sent = zip(*[torque_nm for _, torque_nm in state.recent], strict=True)
     reports = [(reported, min(one), max(one)) for reported, one in zip(reported_nm, sent, strict=True)]
-    reporting = state.reporting or any(_follows(*report, limits) for report in reports)
-    if not reporting:
-        return state
+    if state.all_dead or not state.reporting:
+        if any(_follows(*report, limits) for report in reports):
+            state = ActuatorState(recent=state.recent)
+        elif not state.reporting:
+            return state
     a, b, c, d = (_judged(motor, *report, dt_s, limits) for motor, report in zip(state.motors, reports, strict=True))
     if all(motor.verdict in (MotorVerdict.STUCK, MotorVerdict.REVERSED) for motor in (a, b, c, d)):
         return ActuatorState(recent=state.recent)  # four motors do not get stuck at once: the reports did

@@ -36,6 +36,8 @@ from iwm_power_manager.model.parameters import VehicleParams
 
 #: While a wheel is lost, slip is judged this much more strictly: its axle is watched through one wheel only.
 LOST_WHEEL_SLIP_FACTOR = 0.75
+#: Acceleration that motors are asked for which all seem dead, m/s2: no jolt if they come back, on ice either.
+TRIED_MPS2 = 0.6
 
 
 class ControlFaultError(RuntimeError):
@@ -197,6 +199,12 @@ class Controller:
         elif supervision.stale & STALE_WHEELS and not supervision.stale & STALE_SPEED:
             wheels = (speed / radius,) * 4
         demand = shape_demand(monitor.demand_w, monitor.demand_speed_mps, speed, supervision)
+        gains, command = self.actuators.gains, self.command
+        if demand > 0.0 and command and self.actuators.all_dead:
+            # Perhaps only their reports are dead. Braking, nothing is lost by doing without them.
+            chassis, floor_mps = self._vehicle.chassis, self._vehicle.driver.power_speed_floor_mps
+            demand = min(demand, TRIED_MPS2 * chassis.mass_kg * max(abs(command.speed_mps), floor_mps))
+            gains = (1.0, 1.0, 1.0, 1.0)
         discharge, charge = battery_limits(monitor.soc, monitor.temperature_c, self._held_vehicle)
         factor = supervision.motor_factor
         return Measurement(
@@ -208,7 +216,7 @@ class Controller:
             discharge_limit_w=discharge * factor,
             charge_limit_w=charge * factor,
             soc=monitor.soc,
-            motor_gain=self.actuators.gains,
+            motor_gain=gains,
             direction=monitor.direction,
             motor_stuck_nm=self.actuators.stuck_nm,
             acceleration_mps2=monitor.acceleration_mps2(now_ns),

@@ -206,6 +206,19 @@ def test_reports_of_all_motors_that_stand_still_switch_none_off_for_good(torque)
 
 
 @pytest.mark.parametrize("wheel", range(4))
+def test_four_motors_that_seem_dead_are_judged_anew_once_one_follows_and_three_are_not(wheel):
+    dead = drive(following(), steady(60.0), steady(0.0))[-1]
+    assert dead.all_dead
+    assert dead.gains == (0.0,) * 4
+    follows = tuple(60.0 if i == wheel else 0.0 for i in range(4))
+    states = drive(dead, steady(60.0), [follows] * 60)
+    assert states[0].gains == (1.0,) * 4
+    assert states[-1].gains == tuple(float(i == wheel) for i in range(4)), "those that do not follow are found again"
+    assert not states[-1].all_dead
+    assert drive(states[-1], steady(60.0), steady(60.0))[-1].gains == states[-1].gains
+
+
+@pytest.mark.parametrize("wheel", range(4))
 def test_friction_makes_up_for_a_stuck_motor_while_braking(wheel):
     car = load_vehicle(resolve(Path("config/vehicles/jalalmaab_2015.yaml"))).params
     stuck = tuple(60.0 if i == wheel else 0.0 for i in range(4))

@@ -321,6 +321,29 @@ class TestMotorReports:
         assert motor(values)[1] == 0.0
         assert motor(values)[0] > 1.0
 
+    def reported(self, drive, factor, steps, **inputs) -> list[float]:
+        for _ in range(steps):
+            torques = tuple(factor * torque for torque in motor(drive.steps[-1]))
+            drive.controller.monitor.take_torques(JointReading(drive.now_ns, NAMES, torques), drive.now_ns)
+            values = drive.run(1, **inputs)
+        return motor(values)
+
+    @pytest.mark.parametrize(("direction", "speed", "least_mps2"), [(1, 0.0, 0.2), (-1, -1.0, 0.55), (1, 10.0, 0.59)])
+    def test_four_motors_that_seem_dead_drive_gently_brake_not_and_are_whole_once_one_follows(
+        self, drive, direction, speed, least_mps2
+    ) -> None:
+        drive.controller.monitor.direction = float(direction)
+        driving, braking = {"speed": speed, "demand": 15000.0}, {"speed": speed, "demand": -3000.0}
+        drive.run(60, **driving)
+        whole = sum(self.reported(drive, 1.0, 60, **driving))
+        for _ in range(2):
+            tried = self.reported(drive, 0.0, 60, **driving)
+            assert least_mps2 <= direction * sum(tried) / RADIUS / VEHICLE.chassis.mass_kg <= 0.61
+            assert self.reported(drive, 0.0, 60, **braking) == [0.0] * 4
+            assert min(map(abs, friction(drive.steps[-1]))) > 1.0
+        assert sum(self.reported(drive, 0.0, 30, speed=speed, demand=4.0)) < 0.1 * abs(sum(tried))
+        assert sum(self.reported(drive, 1.0, 120, **driving)) == pytest.approx(whole, rel=0.1)
+
 
 class TestRecord:
     def test_signals_have_unique_names_and_meanings(self) -> None:
