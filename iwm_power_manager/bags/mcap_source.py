@@ -396,7 +396,8 @@ class McapSource:
         filled = [piece for piece in self._pieces if piece.end_ns]  # one without messages has no times
         ends = accumulate((piece.end_ns for piece in filled), max)
         jumps = any(after.start_ns < end - limits.SET_BACK_NS for end, after in zip(ends, filled[1:], strict=False))
-        if not jumps and len(filled) != 1:
+        alone = len(filled) == 1 and filled[0].end_ns - filled[0].start_ns > limits.SET_BACK_NS
+        if not (jumps or alone):
             return False
         newest: dict[int, int] = {}
         for piece in filled:

@@ -9,7 +9,8 @@ middle of its `Writer.close` and reads in that of `DirectoryReader.open`, which 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -176,6 +177,15 @@ _KINDS = {
         {"message_count": int, "topic_metadata": {"name": str, "type": str, "serialization_format": str}}
     ],
 }
+
+
+def topic_counts(files: Iterable[tuple[Mapping[int, Topic], Mapping[int, int]]]) -> Counter[str]:
+    """Messages by the name of their topic, from the topics and the counts of each file, by channel."""
+    counts: Counter[str] = Counter()
+    for topics, found in files:
+        for number, topic in topics.items():
+            counts[topic.name] += found.get(number, 0)
+    return counts
 
 
 def miscounted(information: Mapping[str, Any], topics: Mapping[str, int]) -> bool:

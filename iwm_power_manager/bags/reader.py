@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, Self
 
 from iwm_power_manager.bags.limits import PACKED, ZSTD_MAGIC, check_exists, decompress, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_source import MAGIC, McapSource
-from iwm_power_manager.bags.metadata import METADATA_FILE, Topic, miscounted, read_metadata, text_values
+from iwm_power_manager.bags.metadata import METADATA_FILE, Topic, miscounted, read_metadata, text_values, topic_counts
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError
 
@@ -94,11 +94,8 @@ class BagReader:
         self.custom_data = text_values(self.information.get("custom_data"))
         for source in self.sources:
             self._take(source)
-        if not (self.damage or not self.information):
-            held: Counter[str] = Counter()
-            for source in self.sources:
-                for number, topic in source.topics().items():
-                    held[topic.name] += source.counts[number]
+        if self.information and not self.damage:
+            held = topic_counts((source.topics(), source.counts) for source in self.sources)
             if miscounted(self.information, held):
                 self.notes.append(f"{self.path}: metadata.yaml miscounts the messages: {held.total()} are there")
         filled = [source for source in self.sources if source.counts.total()]

@@ -27,7 +27,15 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from iwm_power_manager.bags import mcap_source, reader
 from iwm_power_manager.bags.limits import PACKED, check_exists, regular_file
 from iwm_power_manager.bags.mcap_file import McapFile
-from iwm_power_manager.bags.metadata import FileSpan, Topic, bag_information, miscounted, read_metadata, text_values
+from iwm_power_manager.bags.metadata import (
+    FileSpan,
+    Topic,
+    bag_information,
+    miscounted,
+    read_metadata,
+    text_values,
+    topic_counts,
+)
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
 from iwm_power_manager.errors import BagError
@@ -135,7 +143,9 @@ def recover(path: Path | str) -> Recovery:
             raise BagError(f"{left_out[0].damage}; nothing to recover")
         information, problem = read_metadata(path) if folder else ({}, "none")
         fits = not (problem or left_out) and reader.listed_files(information).keys() == {name.name for name in names}
-        fits = fits and not miscounted(information, _topic_counts(files))
+        fits = fits and not miscounted(
+            information, topic_counts((file.seen.topics, file.seen.counts) for file in files)
+        )
         sqlite = all(file.is_sqlite and not file.problem for file in files)
         for file in files:
             if file.problem or (file.is_sqlite and not sqlite) or (file.is_compressed and not fits):
@@ -153,14 +163,6 @@ def recover(path: Path | str) -> Recovery:
             max(file.seen.end_ns for file in files),
             stale,
         )
-
-
-def _topic_counts(files: Iterable[_File]) -> Counter[str]:
-    counts: Counter[str] = Counter()
-    for file in files:
-        for number, topic in file.seen.topics.items():
-            counts[topic.name] += file.seen.counts[number]
-    return counts
 
 
 def _names(path: Path) -> list[Path]:
@@ -374,7 +376,7 @@ class _Copy:
 def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Mapping[str, object]) -> None:
     """`metadata.yaml` of the whole bag, with what the old one or the files know of it."""
     topics: dict[str, Topic] = {}
-    counts = _topic_counts(files)
+    counts = topic_counts((file.seen.topics, file.seen.counts) for file in files)
     custom_data: dict[str, str] = {}
     distro = str(recorded.get("ros_distro") or "")
     for file in files:

@@ -42,6 +42,11 @@ _COUNTS = f"""
     SELECT topic_id, count(*), min(timestamp), max(timestamp), total(typeof(data) <> 'blob')
     FROM messages WHERE {_TIMED} GROUP BY topic_id
 """  # noqa: S608 - constants
+#: Whether any time goes back, which takes a tenth of the time of asking topic by topic.
+_GOES_BACK = f"""
+    SELECT 1 FROM messages AS one JOIN messages AS next ON next.rowid = one.rowid + 1
+    WHERE next.timestamp < one.timestamp - {limits.SET_BACK_NS} LIMIT 1
+"""  # noqa: S608 - constants
 _SET_BACK = f"""
     SELECT 1 FROM (
         SELECT timestamp - lag(timestamp) OVER (PARTITION BY topic_id ORDER BY rowid) AS step
@@ -170,7 +175,7 @@ class SqliteSource:
                 self.start_ns = min(self.start_ns, int(start_ns)) if self.counts else int(start_ns)
                 self.end_ns = max(self.end_ns, int(end_ns))
                 self.counts[number] = count
-            self.set_back = self._database.execute(_SET_BACK).fetchone() is not None
+            self.set_back = all(self._database.execute(query).fetchone() for query in (_GOES_BACK, _SET_BACK))
         except sqlite3.Error as error:
             self.note(f"is damaged: {_one_line(error)}")
             self.counts.clear()
