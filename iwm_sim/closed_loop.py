@@ -104,6 +104,10 @@ class Row(NamedTuple):
 COLUMNS = Row._fields
 
 
+#: The wheels, in names of columns.
+SHORT_WHEEL_NAMES = ("fl", "fr", "rl", "rr")
+
+
 class RoadRow(NamedTuple):
     """What a step of a drive has beside `Row`: each wheel, and the car in the plane; taken at its start.
 

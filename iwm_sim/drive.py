@@ -26,7 +26,7 @@ from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.pedals import full_braking_w, pedal_power_w
 from iwm_power_manager.model.tyre import slip_ratio
 from iwm_sim import double_track, plant
-from iwm_sim.closed_loop import COLUMNS, ROAD_COLUMNS, Decision, RoadRow, Run, row_of
+from iwm_sim.closed_loop import COLUMNS, ROAD_COLUMNS, SHORT_WHEEL_NAMES, Decision, RoadRow, Run, row_of
 from iwm_sim.faults import Faults
 from iwm_sim.scenario import Scenario
 from iwm_sim.steering import LaneKeeper
@@ -333,7 +333,7 @@ def _road_row(
 ) -> RoadRow:
     """The row of a step from the car before and after it."""
     ways = -1.0 if before.speed_mps < 0.0 else 1.0
-    names = ("fl", "fr", "rl", "rr")
+    names = SHORT_WHEEL_NAMES
     slips = [
         slip_ratio(ways * w, abs(before.speed_mps), axle.wheel.radius_m, axle.tyre.slip_speed_floor_mps)
         for w, axle in zip(

@@ -7,14 +7,13 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from iwm_power_manager.control.types import Wheels
+from iwm_power_manager.control.types import WHEEL_NAMES, Wheels
 
-WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 SPEED = "vehicle_speed"
 ALL_WHEELS = "wheels"
-SENSORS = (SPEED, ALL_WHEELS, *(f"wheel_{name}" for name in WHEELS))
-MOTORS = tuple(f"motor_{name}" for name in WHEELS)
-BRAKES = tuple(f"brake_{name}" for name in WHEELS)
+SENSORS = (SPEED, ALL_WHEELS, *(f"wheel_{name}" for name in WHEEL_NAMES))
+MOTORS = tuple(f"motor_{name}" for name in WHEEL_NAMES)
+BRAKES = tuple(f"brake_{name}" for name in WHEEL_NAMES)
 ACTUATORS = (*MOTORS, *BRAKES)
 MESSAGES = ("vehicle_speed", "wheel_states", "power_demand", "battery_state")
 
@@ -67,7 +66,7 @@ class Faults:
         """What the wheel speed sensors show (NaN: nothing)."""
         a, b, c, d = (
             self._sensed(f"wheel_{name}", self._sensed(ALL_WHEELS, value, time_s, name), time_s)
-            for name, value in zip(WHEELS, wheel_radps, strict=True)
+            for name, value in zip(WHEEL_NAMES, wheel_radps, strict=True)
         )
         return a, b, c, d
 

@@ -19,12 +19,10 @@ import numpy.typing as npt
 
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.parameters import VehicleParams
-from iwm_sim.closed_loop import ROAD_COLUMNS, Run
+from iwm_sim.closed_loop import ROAD_COLUMNS, SHORT_WHEEL_NAMES, Run
 from iwm_sim.metrics import longest_s
 
 FloatArray = npt.NDArray[np.float64]
-
-_WHEELS = ("fl", "fr", "rl", "rr")
 
 #: A wheel is locked at this slip, and beyond the critical one at this; the car moves above this speed, m/s.
 LOCKED_SLIP = -0.9
@@ -61,7 +59,7 @@ class Driven:
 
     def wheels(self, column: str) -> FloatArray:
         """Four columns, (steps, 4): `column` has a `{}` in the place of the wheel."""
-        return np.stack([self[column.format(wheel)] for wheel in _WHEELS], axis=1)
+        return np.stack([self[column.format(wheel)] for wheel in SHORT_WHEEL_NAMES], axis=1)
 
 
 def driven(run: Run, vehicle: VehicleParams) -> Driven:

@@ -19,11 +19,11 @@ from iwm_power_manager.control.controller import Controller, ControllerLimits
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.settings import Settings, default_settings
 from iwm_power_manager.control.thresholds import Thresholds, actuator_limits, for_car, input_limits, supervision_limits
+from iwm_power_manager.control.types import WHEEL_NAMES
 from iwm_power_manager.policy import PolicyBank
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.closed_loop import BATTERY_TEMPERATURE_DEGC, Run, decision_of
 from iwm_sim.drive import Drive, Sensors
-from iwm_sim.faults import WHEELS
 from iwm_sim.road_measures import OF_HEALTHY, driven, measured
 from iwm_sim.scenario import Bound, Scenario
 
@@ -80,7 +80,7 @@ def controller_of(scenario: Scenario, settings: Settings | None = None, policies
         actuators=actuator_limits(thresholds),
     )
     bank = PolicyBank(policies, (0.0, 0.5, 0.0, 0.5), vehicle)
-    controller = Controller(params, WHEELS, limits, settings, bank.table(settings.strategy, prior), prior)
+    controller = Controller(params, WHEEL_NAMES, limits, settings, bank.table(settings.strategy, prior), prior)
     controller.table_of = functools.partial(bank.table, settings.strategy)
     return controller
 
@@ -94,8 +94,8 @@ def give(controller: Controller, sensors: Sensors, drive: Drive, now_ns: int) ->
     if not drive.lost("vehicle_speed") and not math.isnan(sensors.speed_mps):
         monitor.take_speed(SpeedReading(now_ns, sensors.speed_mps), now_ns)
     if not drive.lost("wheel_states"):
-        monitor.take_wheels(JointReading(now_ns, WHEELS, sensors.wheel_speed_radps), now_ns)
-        monitor.take_torques(JointReading(now_ns, WHEELS, sensors.motor_torque_nm), now_ns)
+        monitor.take_wheels(JointReading(now_ns, WHEEL_NAMES, sensors.wheel_speed_radps), now_ns)
+        monitor.take_torques(JointReading(now_ns, WHEEL_NAMES, sensors.motor_torque_nm), now_ns)
     if not drive.lost("battery_state"):
         battery = BatteryReading(
             now_ns,

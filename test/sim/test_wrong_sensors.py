@@ -13,13 +13,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from iwm_sim.faults import WHEELS, Fault
+from iwm_power_manager.control.types import WHEEL_NAMES
+from iwm_sim.faults import Fault
 from iwm_sim.road_measures import driven, measured
 from iwm_sim.road_run import check_scenario, drive_scenario
 from iwm_sim.scenario import Bound, Demand, Friction, Scenario, load_scenario
 
 BASE = load_scenario("speed_high")
-SENSORS = [f"wheel_{name}" for name in WHEELS]
+SENSORS = [f"wheel_{name}" for name in WHEEL_NAMES]
 MOST_S = 5.0
 LEAST_MPS2 = 0.5
 
