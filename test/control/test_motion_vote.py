@@ -10,6 +10,9 @@ import pytest
 from iwm_power_manager.control.motion_vote import (
     ASKED_MPS2,
     ASKED_PART,
+    BEST_ROAD,
+    DEAD,
+    HALF,
     fresh_motion,
     restarted_motion,
     road_resistance_mps2,
@@ -18,9 +21,10 @@ from iwm_power_manager.control.motion_vote import (
 )
 from iwm_power_manager.control.speed_doubt import AGREE_MPS, AGREE_PART
 from iwm_power_manager.control.types import Agreed, Compared, Measurement, initial_state
-from iwm_power_manager.control.wheel_doubt import SPEED_MPS, SPEED_PART, WHOLE_BRAKES, Turning, turning_of
+from iwm_power_manager.control.wheel_doubt import SLOW_MPS, SPEED_MPS, SPEED_PART, WHOLE_BRAKES, Turning, turning_of
 from iwm_power_manager.model.chassis import aerodynamic_force_n, rolling_force_n
 from iwm_power_manager.model.parameters import FrictionBrake
+from iwm_power_manager.model.tyre import friction_coefficient
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 
@@ -35,8 +39,10 @@ def test_air_and_tyres_slow_the_car_down_as_in_the_model(speed):
     assert road_resistance_mps2(-speed, CAR) == pytest.approx(-force / CAR.chassis.mass_kg)
 
 
-def test_a_car_that_stands_is_not_slowed_down():
-    assert road_resistance_mps2(0.0, CAR) == 0.0
+def test_a_car_that_comes_to_rest_is_slowed_down_less_and_less_by_its_tyres():
+    for part in (0.0, 0.25, 0.5):
+        force = aerodynamic_force_n(part * SLOW_MPS, CAR.chassis) + part * rolling_force_n(0.0, CAR.chassis)
+        assert road_resistance_mps2(part * SLOW_MPS, CAR) == pytest.approx(force / CAR.chassis.mass_kg)
 
 
 @pytest.mark.parametrize("start", [0.0, 5.0, -5.0, 30.0])
@@ -57,18 +63,24 @@ def test_a_reference_that_begins_anew_remembers_no_time_and_no_way():
     assert fresh == expected
 
 
-def braked(rims, friction_nm=400.0):
-    """Part of each brake's torque that is found when a car at 20 m/s has lost no speed for 0.5 s while braked."""
+def restarted(rims, friction_nm, *, gain=WHOLE_BRAKES, moved_mps=-3.0, car=CAR):
+    """What is found of a car at 20 m/s that has lost no speed for 0.5 s, each brake asked for its torque."""
     start = initial_state()
-    w = tuple(rim / RADIUS for rim in rims)
+    radii = (car.front.wheel.radius_m,) * 2 + (car.rear.wheel.radius_m,) * 2
+    w = tuple(rim / radius for rim, radius in zip(rims, radii, strict=True))
     fl, fr, rl, rr = (
-        wheel._replace(total_nm=-friction_nm, speed_radps=speed, road_nm=-friction_nm)
-        for wheel, speed in zip(start.wheels, w, strict=True)
+        wheel._replace(total_nm=-torque, speed_radps=speed, road_nm=-torque)
+        for wheel, speed, torque in zip(start.wheels, w, friction_nm, strict=True)
     )
-    motion = start.motion._replace(speed_mps=16.0, shown_mps=20.0)
-    turning = turning_of(w, (fl, fr, rl, rr), 1.0, False, 0.01, motion.wheel_doubt_s, CAR)
-    agreed = Agreed(0.5, 20.0, -3.0, math.nan)
-    return restarted_motion(20.0, rims, agreed, 20.0, (fl, fr, rl, rr), turning, motion, CAR).brake_gain
+    motion = start.motion._replace(speed_mps=16.0, shown_mps=20.0, brake_gain=gain)
+    turning = turning_of(w, (fl, fr, rl, rr), 1.0, False, 0.01, motion.wheel_doubt_s, car)
+    agreed = Agreed(0.5, 20.0, moved_mps, math.nan)
+    return restarted_motion(20.0, rims, agreed, 20.0, (fl, fr, rl, rr), turning, motion, car)
+
+
+def braked(rims, friction_nm=400.0):
+    """Part of each brake's torque that is found where all were to give the same."""
+    return restarted(rims, (friction_nm,) * 4).brake_gain
 
 
 @pytest.mark.parametrize("rim_part", [1.0, 0.9999, 0.999])
@@ -76,6 +88,47 @@ def braked(rims, friction_nm=400.0):
 def test_brakes_whose_wheels_slip_less_than_any_road_would_let_them_are_found_weak_and_no_others(rim_part, weak):
     rims = tuple(20.0 * (rim_part if i in weak else 0.8) for i in range(4))
     assert [gain < 1.0 for gain in braked(rims)] == [i in weak for i in range(4)]
+
+
+#: Front and rear are unlike in size and load.
+UNLIKE = CAR._replace(
+    rear=CAR.rear._replace(wheel=CAR.rear.wheel._replace(radius_m=0.3)),
+    chassis=CAR.chassis._replace(front_axle_to_cg_m=0.7, rear_axle_to_cg_m=1.6),
+)
+TORQUES, GAINS = (420.0, 360.0, 330.0, 280.0), (1.0, 0.9, 0.8, 0.7)
+
+
+@pytest.mark.parametrize("blamed", [(0,), (1,), (2,), (3,), (0, 2), (0, 1, 2, 3), ()])
+def test_a_brake_loses_the_part_of_its_force_that_is_missing(blamed):
+    rims = tuple(20.0 * (1.0 if i in blamed else 0.8) for i in range(4))
+    radii = (UNLIKE.front.wheel.radius_m,) * 2 + (UNLIKE.rear.wheel.radius_m,) * 2
+    who = blamed or range(4)
+    # Not so much that any of them would count as dead.
+    force_n = sum(TORQUES[i] / radii[i] for i in who)
+    lack_mps2 = 2.6
+    part = 1.0 - lack_mps2 * UNLIKE.chassis.mass_kg / force_n
+    part = part if part >= DEAD else 0.0
+    found = restarted(rims, TORQUES, gain=GAINS, moved_mps=-0.5 * lack_mps2, car=UNLIKE).brake_gain
+    assert found == pytest.approx([part * gain if i in who else gain for i, gain in enumerate(GAINS)])
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("slip", [0.01, 0.03])
+def test_half_of_what_the_best_road_takes_at_its_slip_is_what_a_whole_brake_may_give(wheel, slip):
+    axle = UNLIKE.front if wheel < 2 else UNLIKE.rear
+    turning = turning_of((0.0,) * 4, initial_state().wheels, 1.0, False, 0.01, (0.0,) * 4, UNLIKE)
+    load_nm = turning.front_nm if wheel < 2 else turning.rear_nm
+    bound = BEST_ROAD * load_nm * friction_coefficient(slip, 1.0, axle.tyre) / HALF
+    rims = tuple(20.0 * (1.0 - slip if i == wheel else 0.8) for i in range(4))
+    for part, alone in ((1.05, True), (0.95, False)):
+        torques = tuple(part * bound if i == wheel else 60.0 for i in range(4))
+        weak = [gain < 1.0 for gain in restarted(rims, torques, car=UNLIKE).brake_gain]
+        assert weak == [i == wheel or not alone for i in range(4)]
+
+
+def test_brakes_that_are_back_are_whole_and_no_wheel_is_doubted_for_it():
+    after = restarted((20.0,) * 4, TORQUES, gain=GAINS, moved_mps=3.0)
+    assert (after.brake_gain, after.wheel_doubt_s) == (WHOLE_BRAKES, (0.0,) * 4)
 
 
 def test_no_brake_is_weak_that_was_not_asked_for_anything():
@@ -153,3 +206,15 @@ def test_no_brake_of_another_system_makes_a_wheel_faster(speed):
     for sign, agreed in ((-1.0, Agreed(0.01, speed, 0.0, 0.0)), (1.0, NEVER)):
         rims = (speed + sign * off, speed, speed, speed)
         assert voted(speed, rims, speed + 3.0, NEVER, car=foreign)[0] == agreed
+
+
+def test_speeds_that_agree_without_any_torque_are_right_soon():
+    agreed = Agreed(0.2, 20.0, 0.0, math.nan)
+    for predicted in (15.0, 25.0):
+        assert voted(20.0, (20.0,) * 4, predicted, agreed)[2]
+
+
+def test_an_accelerometer_that_has_felt_what_the_forces_say_keeps_wheels_that_might_skid_from_being_right():
+    agreed = Agreed(1.5, 24.0, 0.8, 0.0)
+    assert not voted(20.0, (20.0,) * 4, 25.0, agreed, torque_nm=-60.0, felt_mps2=0.0)[2]
+    assert voted(20.0, (20.0,) * 4, 25.0, agreed, torque_nm=-60.0)[2]
