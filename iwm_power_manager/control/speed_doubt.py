@@ -35,7 +35,7 @@ LEAST_PART = 0.72
 #: Sensor and wheels are compared when these first roll freely, or differ from it against their torques, for this long
 #: and faster than this. Beyond the last speed a sensor that is off by 5 m/s would look like one that is wrong by a
 #: factor, and the wheels are believed.
-COMPARED_S, COMPARED_MPS, COMPARED_MOST_MPS = 0.2, 2.0, 12.5
+COMPARED_S, COMPARED_MPS, COMPARED_MOST_MPS = 0.2, 1.2, 12.5
 
 
 class Rolling(NamedTuple):

@@ -114,6 +114,18 @@ def test_a_sensor_that_is_wrong_by_a_factor_from_standstill_on_takes_no_brakes(w
     assert found["longest_under_braked_s"] <= 0.3
 
 
+@pytest.mark.parametrize(
+    ("target", "factor"), [("wheels", 1.19), ("wheels", 1.22), ("vehicle_speed", 0.82), ("vehicle_speed", 0.84)]
+)
+def test_a_car_whose_sensor_is_wrong_by_a_factor_that_looks_like_slip_drives_off(target, factor):
+    scenario = dataclasses.replace(
+        braking(0.0, 0.0, 0.9, (wrong(target, "factor", factor, 0.0),)),
+        demand=(Demand(0.0, "power_w", 12e3),),
+        duration_s=4.0,
+    )
+    assert drive_scenario(scenario)["speed_mps"][-1] > 8.0
+
+
 @settings(max_examples=5)
 @given(st.floats(5.0, 40.0), st.floats(20e3, 200e3))
 def test_with_true_sensors_no_wheel_skids_on_a_slippery_road(speed_mps, power_w):
