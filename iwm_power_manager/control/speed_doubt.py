@@ -9,6 +9,7 @@ from typing import NamedTuple
 from iwm_power_manager.control.types import Compared, MotionState, Wheels
 from iwm_power_manager.control.wheel_doubt import (
     DISTRUST_S,
+    ICE_FRICTION,
     SLOW_MPS,
     SPEED_MPS,
     SPEED_PART,
@@ -41,7 +42,8 @@ COMPARED_S, COMPARED_MPS, COMPARED_MOST_MPS = 0.2, 1.2, 12.5
 class Rolling(NamedTuple):
     """What the wheels that are believed say: how many, their rim speeds' extremes and mean, and whether they roll.
 
-    `freely` is without slip that would show; `nearly` is with less than makes a wrong speed of it.
+    `freely` is without slip that would show; `nearly` is with less than makes a wrong speed of it. `pushed` is 1 or -1
+    where all four have the torque that makes them slip together, faster or slower than the car, on the smoothest ice.
     """
 
     believed: int
@@ -50,6 +52,16 @@ class Rolling(NamedTuple):
     mean_mps: float
     freely: bool
     nearly: bool
+    pushed: float
+
+
+@kernel
+def _pushed(t: Turning) -> float:
+    a, b, c, d = t.torque_nm
+    front_nm, rear_nm = ICE_FRICTION * t.front_nm, ICE_FRICTION * t.rear_nm
+    if min(a, b) >= front_nm and min(c, d) >= rear_nm:
+        return 1.0
+    return -1.0 if max(a, b) <= -front_nm and max(c, d) <= -rear_nm else 0.0
 
 
 @kernel
@@ -76,7 +88,7 @@ def rolling_of(rims: Wheels, doubt_s: Wheels, turning: Turning) -> Rolling:
     agree = count >= 3 and high - low <= AGREE_PART * abs(high) + AGREE_MPS
     mean = total / max(count, 1)
     nearly = agree and (used < NEARLY_FRICTION or abs(high) < NEARLY_MPS)
-    return Rolling(count, low, high, mean, agree and used < ROLLING_FRICTION, nearly)
+    return Rolling(count, low, high, mean, agree and used < ROLLING_FRICTION, nearly, _pushed(turning))
 
 
 @kernel
@@ -111,7 +123,8 @@ def judged_speed(
     shown_s = before.shown_s + dt if same else 0.0
     moved = before.moved_mps + acceleration * dt if same else 0.0
     apart = 0.0
-    if rolling.freely and abs(shown - rolling.mean_mps) > APART_PART * abs(rolling.mean_mps) + APART_MPS:
+    over = rolling.mean_mps - shown
+    if rolling.freely and rolling.pushed * over <= 0.0 and abs(over) > APART_PART * abs(rolling.mean_mps) + APART_MPS:
         apart = before.apart_s + dt
         if apart > APART_S and before.doubt_s == 0.0:
             predicted = rolling.mean_mps  # four against one, and nothing that could make them slip
@@ -136,7 +149,7 @@ def compared_speeds(
     mean = mean_of(rims)
     slow = math.isnan(shown) or min(abs(shown), abs(mean)) <= COMPARED_MPS or shown * mean < 0.0
     agree = max(rims) - min(rims) <= AGREE_PART * abs(mean) + AGREE_MPS
-    freely = used_friction_of(t.road_nm, t) < ROLLING_FRICTION
+    freely = used_friction_of(t.road_nm, t) < ROLLING_FRICTION and _pushed(t) * (mean - shown) <= 0.0
     if slow or not agree or not (freely or mean_of(t.torque_nm) * (mean - shown) < 0.0):
         return before, factor, False
     if before.lasted_s >= COMPARED_S:

@@ -275,6 +275,16 @@ def test_a_sensor_that_is_off_by_no_factor_from_the_start_on_is_found_when_the_w
     assert motion.speed_mps == pytest.approx(v, abs=0.7)
 
 
+@pytest.mark.parametrize(("torque", "part"), [(40.0, 1.09), (40.0, 1.3), (-40.0, 0.91), (-40.0, 0.8)])
+def test_wheels_that_slip_together_on_the_smoothest_ice_contradict_no_sensor_and_are_no_factor_apart(torque, part):
+    car = Car(6.0)
+    slips = [1.0 + (part - 1.0) * min(i / 30.0, 1.0) for i in range(100)]
+    slipping = [car.step(torque, wheels=lambda v, s=slip: (s * v / RADIUS,) * 4).doubted for slip in slips]
+    assert max(slipping) == 0
+    against = [car.step(-torque, wheels=lambda v: (part * v / RADIUS,) * 4).doubted for _ in range(60)]
+    assert against[-1] != 0, "no torque makes them slip that way"
+
+
 @pytest.mark.parametrize("factor", [0.6, 0.97, 1.03, 1.6])
 def test_sensor_and_wheels_that_are_nearly_the_same_or_far_apart_are_no_factor_apart(factor):
     car = Car(20.0)

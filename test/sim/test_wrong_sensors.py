@@ -126,6 +126,16 @@ def test_a_car_whose_sensor_is_wrong_by_a_factor_that_looks_like_slip_drives_off
     assert drive_scenario(scenario)["speed_mps"][-1] > 8.0
 
 
+@pytest.mark.parametrize(("friction", "speed_mps", "pedal"), [(0.06, 9.6, 0.6), (0.06, 3.6, 0.7), (0.07, 2.1, 0.5)])
+def test_with_true_sensors_no_wheel_spins_on_the_smoothest_ice(friction, speed_mps, pedal):
+    scenario = dataclasses.replace(
+        braking(speed_mps, 0.0, friction, ()), demand=(Demand(0.3, "accelerator", pedal),), assumed_friction=0.9
+    )
+    found = measured(("longest_spinning_s", "doubted_s"), driven(drive_scenario(scenario), scenario.truth))
+    assert found["longest_spinning_s"] <= 0.1
+    assert found["doubted_s"] == 0.0
+
+
 @settings(max_examples=5)
 @given(st.floats(5.0, 40.0), st.floats(20e3, 200e3))
 def test_with_true_sensors_no_wheel_skids_on_a_slippery_road(speed_mps, power_w):
