@@ -3,14 +3,19 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
 from iwm_power_manager.control.types import initial_state
 from iwm_power_manager.control.wheel_doubt import (
     CALM_S,
     COMMON_RADPS,
+    GOOD_MPS,
+    GOOD_PART,
     HELD_MPS,
     HELD_PART,
+    ICE_FRICTION,
     JUMP_RADPS,
     LEAST_FACTOR,
     RETURN_S,
@@ -18,7 +23,9 @@ from iwm_power_manager.control.wheel_doubt import (
     Turning,
     combined_factor,
     common_jump,
+    middle_of,
     wheel_doubts,
+    wheels_to_use,
 )
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -26,6 +33,7 @@ from iwm_power_manager.vehicle import load_vehicle
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
 RADIUS = CAR.front.wheel.radius_m
 DT = 0.01
+LOAD_NM = 617.0
 NONE = (0.0, 0.0, 0.0, 0.0)
 WHEELS = pytest.mark.parametrize("wheel", range(4))
 
@@ -34,12 +42,12 @@ def one(wheel, value, other):
     return tuple(value if i == wheel else other for i in range(4))
 
 
-def judged(wheel, off_mps, change_radps=0.0, gated=False, stray_s=0.0, speed=20.0):
+def judged(wheel, off_mps, change_radps=0.0, gated=False, stray_s=0.0, doubt_s=0.0, speed=20.0):
     """What is found of one wheel that is off while the others roll: time it has stayed away, time of its doubt."""
     w = one(wheel, (speed + off_mps) / RADIUS, speed / RADIUS)
     change = one(wheel, change_radps, 0.0)
-    turning = Turning(NONE, change, NONE, one(wheel, gated, False), 600.0, 600.0)
-    stray, doubt = wheel_doubts(w, turning, speed, 0.0, DT, one(wheel, stray_s, 0.0), NONE, CAR)
+    turning = Turning(NONE, change, NONE, one(wheel, gated, False), LOAD_NM, LOAD_NM)
+    stray, doubt = wheel_doubts(w, turning, speed, 0.0, DT, one(wheel, stray_s, 0.0), one(wheel, doubt_s, 0.0), CAR)
     assert [value for i, value in enumerate(stray + doubt) if i % 4 != wheel] == [0.0] * 6
     return stray[wheel], doubt[wheel]
 
@@ -66,21 +74,67 @@ def test_a_wheel_that_nothing_holds_is_doubted_when_it_has_stayed_away_for_too_l
     assert judged(wheel, -8.0, stray_s=RETURN_S - 0.5 * DT)[1] > 0.0
 
 
-def jump_of(jump_radps):
-    """Factor that undoes a jump of all four wheels of a car that rolls at 8 m/s."""
+@WHEELS
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_wheel_that_comes_back_slower_than_on_the_smoothest_ice_has_stayed_away(wheel, sign):
+    least = ICE_FRICTION * LOAD_NM / CAR.front.wheel.inertia_kgm2 * DT
+    assert judged(wheel, sign * 8.0, -sign * 0.99 * least)[0] == DT
+    assert judged(wheel, sign * 8.0, -sign * 1.01 * least)[0] == 0.0
+
+
+@WHEELS
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_doubted_wheel_is_good_again_by_the_time_it_is_near(wheel, sign):
+    bound = GOOD_PART * 20.0 + GOOD_MPS
+    assert judged(wheel, sign * 0.95 * bound, doubt_s=0.2)[1] == pytest.approx(0.2 - DT)
+    assert judged(wheel, sign * 1.05 * bound, doubt_s=0.2)[1] == 0.2
+
+
+@pytest.mark.parametrize("rims", list(itertools.permutations((1.0, 4.0, 6.0, 30.0))))
+def test_the_middle_of_four_speeds_is_the_mean_of_the_two_between_the_others(rims):
+    assert middle_of(rims) == pytest.approx(5.0)
+
+
+#: The rear wheels are smaller.
+UNLIKE = CAR._replace(rear=CAR.rear._replace(wheel=CAR.rear.wheel._replace(radius_m=0.2)))
+RADII = (RADIUS, RADIUS, 0.2, 0.2)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize(("demand_w", "rolls"), [(-1e3, 12.0), (1e3, 9.0)])
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 2, 1, 0)])
+def test_where_no_wheel_is_believed_the_one_that_slips_least_rolls_and_the_others_slip_beside_it(
+    sign, demand_w, rolls, order
+):
+    rims = tuple((12.0, 11.0, 10.0, 9.0)[i] for i in order)
+    w = tuple(sign * rim / radius for rim, radius in zip(rims, RADII, strict=True))
+    used = wheels_to_use(w, (0.1,) * 4, sign * 13.0, 0, demand_w, UNLIKE)
+    assert used == pytest.approx(tuple(13.0 / rolls * value for value in w))
+
+
+@pytest.mark.parametrize("part", [0.99 * LEAST_FACTOR, 1.01 / LEAST_FACTOR])
+def test_wheels_that_are_wrong_by_more_than_any_factor_are_taken_as_rolling(part):
+    w = tuple(rim / radius for rim, radius in zip((10.0, 12.0, 11.0, 10.0), RADII, strict=True))
+    used = wheels_to_use(w, (0.1,) * 4, 10.0 * part, 0, 1e3, UNLIKE)
+    assert used == pytest.approx(tuple(10.0 * part / radius for radius in RADII))
+
+
+def jumped(jump_radps):
+    """Factor that undoes a jump of all four wheels of a car that rolls at 8 m/s; for how long they have been calm."""
     start = initial_state()
     rolling = 8.0 / RADIUS
     fl, fr, rl, rr = (wheel._replace(speed_radps=rolling) for wheel in start.wheels)
     motion = start.motion._replace(speed_mps=8.0, shown_mps=8.0, calm_s=2.0 * CALM_S)
     w = (rolling + jump_radps,) * 4
-    return common_jump(8.0, w, (fl, fr, rl, rr), 1.0, DT, motion, CAR)[0]
+    return common_jump(8.0, w, (fl, fr, rl, rr), 1.0, DT, motion, CAR)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_four_wheels_that_jump_by_more_than_noise_either_way_are_undone_by_their_factor(sign):
-    assert jump_of(sign * 0.9 * COMMON_RADPS) == 1.0
+    factor, calm_s = jumped(sign * 0.9 * COMMON_RADPS)
+    assert (factor, calm_s) == (1.0, pytest.approx(2.0 * CALM_S + DT))
     jump = sign * 1.5 * COMMON_RADPS
-    assert jump_of(jump) == pytest.approx(8.0 / (8.0 + RADIUS * jump))
+    assert jumped(jump) == (pytest.approx(8.0 / (8.0 + RADIUS * jump)), 0.0)
 
 
 @pytest.mark.parametrize("before", [1.0, 0.8, 1.25])
