@@ -197,7 +197,7 @@ class BagReader:
         with suppress(BagError):  # a folder that may be entered and not listed
             there = data_files(self.path)
             known = {*present, *(name for name in there if recovered(name) in present)}
-            left_out = [name for name in there if name not in known and _begins_as_data(name, self.path)]
+            left_out = [name for name in there if name not in known and begins_as_data(name, self.path)]
             self.notes += [f"{name}: is not in metadata.yaml and left out" for name in left_out]
         return present
 
@@ -207,11 +207,13 @@ def recovered(path: Path) -> Path:
     return path.with_name(path.name.removesuffix(COMPRESSED_SUFFIX)).with_suffix(".mcap")
 
 
-def _begins_as_data(path: Path, folder: Path) -> bool:
-    """Whether a file is more than what a power cut has left: it begins as one that can be read."""
+def begins_as_data(path: Path, folder: Path | None = None) -> bool:
+    """Whether a file begins as one that can be read, whatever its name: not if it is what a power cut has left."""
     with suppress(BagError):
         regular_file(path, folder)
-        return path.suffix == COMPRESSED_SUFFIX or _head(path, len(MAGIC)) in (MAGIC, _SQLITE_MAGIC[: len(MAGIC)])
+        return path.suffix == COMPRESSED_SUFFIX or _head(path, len(MAGIC)).startswith(
+            (MAGIC, _SQLITE_MAGIC[: len(MAGIC)], ZSTD_MAGIC)
+        )
     return False
 
 

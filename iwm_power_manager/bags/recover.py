@@ -73,7 +73,7 @@ class FileRecovery(NamedTuple):
         out = [f"  {self.name}: {self.damage}; rebuilt with {self.message_count} messages, "
                f"{self.discarded_bytes} torn bytes at its end discarded"]  # fmt: skip
         if self.lost_chunks:
-            out.append(f"  {self.name}: {self.lost_chunks} chunk(s) unreadable")
+            out.append(f"  {self.name}: {self.lost_chunks} chunk(s) or other stretch(es) unreadable")
         if self.kept:
             out.append(f"  {self.name}: original kept as {self.kept}")
         return out
@@ -169,10 +169,13 @@ def _names(path: Path) -> list[Path]:
     """Data files; not those of which an earlier recovery has left its result beside them."""
     check_exists(path)
     if not os.path.isdir(path):
-        if not path.name.removesuffix(reader.COMPRESSED_SUFFIX).endswith(reader.SUFFIXES):
+        named = path.name.removesuffix(reader.COMPRESSED_SUFFIX).endswith(reader.SUFFIXES)
+        if not (named or reader.begins_as_data(path)):
             raise BagError(f"{path}: is no folder and no .mcap or .db3 file")
         return [path]
     names = reader.data_files(path)
+    listed = [path / name for name in reader.listed_files(read_metadata(path)[0])]  # under whatever name
+    names += [name for name in listed if name not in names and reader.begins_as_data(name, path)]
     names = [name for name in names if reader.recovered(name) == name or reader.recovered(name) not in names]
     if not names:
         raise BagError(f"{path}: holds no .mcap or .db3 file")
@@ -239,6 +242,8 @@ class _File:
     def rebuild(self) -> None:
         """Write what can be read to a file of its own, and read that."""
         target = reader.recovered(self.path)
+        if target != self.path and os.path.lexists(target):
+            raise BagError(f"{target}: exists, and what is recovered of {self.path.name} would go there: move it away")
         temporary = target.with_name(target.name + ".recovering")
         try:
             temporary.unlink(missing_ok=True)

@@ -145,7 +145,7 @@ class SqliteSource:
             rows = self._database.execute(
                 "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             )
-            return {str(name): (str(encoding), str(text)) for name, encoding, text in rows}
+            return {_text(name): (_text(encoding), _text(text)) for name, encoding, text in rows}
         except sqlite3.Error as error:
             self.note(f"has no readable definitions: {_one_line(error)}")
             return {}
@@ -184,6 +184,11 @@ class SqliteSource:
         """Add a line to the damage."""
         if line not in self.damage:
             self.damage.append(line)
+
+
+def _text(cell: Any) -> str:
+    """Text of a cell, which some write as bytes."""
+    return cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell or "")
 
 
 def _one_line(error: Exception) -> str:

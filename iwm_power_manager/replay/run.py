@@ -118,8 +118,8 @@ class Replay:
         )
 
     def why_no_step(self) -> str:
-        """Why the bag gave no control step, topic by topic."""
-        return self._source.why_none()
+        """Why the bag gave no control step, topic by topic, and what of it could not be read."""
+        return "; ".join([self._source.why_none(), *self._bag.damage[:_CANDIDATES]])
 
     def _other_unit(self) -> list[str]:
         """A line, if speed and wheel speeds cannot both be in the unit they were read in."""

@@ -153,7 +153,7 @@ def test_a_damaged_chunk_is_left_out_named_and_the_original_kept(tmp_path: Path,
     assert 0 < lost < COUNT // 3
     assert report.missing == {"/a": lost}
     text = "\n".join(report.lines())
-    assert "1 chunk(s) unreadable" in text
+    assert "1 chunk(s) or other stretch(es) unreadable" in text
     assert f"/a: {lost} messages missing in between" in text
 
 

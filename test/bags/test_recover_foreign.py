@@ -21,6 +21,7 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 import foreign_bags as foreign
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.recover import recover
+from iwm_power_manager.errors import BagError
 
 CHANNELS = [
     foreign.SPEED._replace(text=foreign.IDL_TEXT, encoding="ros2idl"),
@@ -428,3 +429,45 @@ def test_behind_a_stretch_that_a_power_cut_has_left_empty_reading_goes_on(tmp_pa
     assert 200 < len(found) < 300
     assert {message.data for message in found} <= {data for _, _, data in foreign.drive(100)}
     assert (folder / "a_0.mcap.damaged").read_bytes() == bytes(content)
+
+
+@pytest.mark.parametrize("name", ["drive", "drive.MCAP", "drive.mcap.zst", "drive.bag"])
+@pytest.mark.parametrize("listed", [True, False])
+def test_what_is_read_under_another_name_is_recovered_under_it(tmp_path: Path, name: str, listed: bool) -> None:
+    folder = torn(tmp_path / "bag")
+    content = (folder / "a_0.mcap").read_bytes()
+    (folder / "a_0.mcap").unlink()
+    (folder / name).write_bytes(zstandard.compress(content) if name.endswith(".zst") else content)
+    foreign.write_metadata(folder, relative_file_paths=[name])
+    path = folder if listed else folder / name
+    before = messages(path)
+    report = recover(path)
+    assert report.files[0].rebuilt
+    assert (folder / name).is_file()
+    assert messages(folder if listed else folder / report.files[0].name) == before != []
+
+
+def test_a_file_that_another_one_would_be_recovered_over_is_left_alone(tmp_path: Path) -> None:
+    other = torn(tmp_path / "bag") / "a_0.mcap"
+    packed = other.with_name("a_0.mcap.zstd")
+    packed.write_bytes(zstandard.compress(other.read_bytes()))
+    before = other.read_bytes()
+    for path in (packed, foreign.write_sqlite(tmp_path / "sqlite", entries()[:20], CHANNELS) / "a_0.db3"):
+        path.with_name("a_0.mcap").write_bytes(before)
+        if path.suffix == ".db3":
+            path.write_bytes(path.read_bytes()[:-100])
+        with pytest.raises(BagError, match=r"a_0\.mcap: exists, and what is recovered of a_0\..* would go there"):
+            recover(path)
+        assert path.with_name("a_0.mcap").read_bytes() == before
+
+
+def test_definitions_that_a_database_holds_as_bytes_are_read(tmp_path: Path) -> None:
+    folder = foreign.write_sqlite(tmp_path / "bag", foreign.drive(3))
+    with sqlite3.connect(folder / "a_0.db3") as database:
+        database.execute("CREATE TABLE message_definitions(topic_type, encoding, encoded_message_definition)")
+        text = foreign.SPEED.text.encode()
+        database.execute("INSERT INTO message_definitions VALUES(?, ?, ?)", (foreign.SPEED.type, b"ros2msg", text))
+    database.close()
+    with BagReader(folder) as reader:
+        topic = reader.topics[foreign.SPEED.topic]
+    assert (topic.definition, topic.encoding) == (foreign.SPEED.text, "ros2msg")

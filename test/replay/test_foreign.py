@@ -360,6 +360,18 @@ def test_a_bag_that_gives_no_step_says_why_topic_by_topic(
         assert f"/demand: {COUNT} messages" in line
 
 
+def test_a_bag_that_gives_no_step_because_it_cannot_be_read_says_that(
+    tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / "bag"
+    packed = foreign.chunk(foreign.message_records(drive(3)), "bz2")
+    foreign.write_metadata(foreign.write_records(bag / "a_0.mcap", foreign.announced(), packed).parent)
+    assert main([str(bag), "--mapping", str(mapping), "--strategy", "equal"]) == BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "gave no control step: " in line
+    assert "is compressed with 'bz2'; known: zstd, lz4" in line
+
+
 def test_messages_that_are_no_cdr_are_not_read_as_such(
     tmp_path: Path, mapping: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
