@@ -34,9 +34,9 @@ APART_PART, APART_MPS, APART_S = 0.05, 0.5, 0.1
 #: A sensor and wheels that differ by no more than this may both be right: tyres, or a wrong radius.
 LEAST_PART = 0.72
 #: Sensor and wheels are compared when these first roll freely, or differ from it against their torques, for this long
-#: and faster than this. Beyond the last speed a sensor that is off by 5 m/s would look like one that is wrong by a
-#: factor, and the wheels are believed.
-COMPARED_S, COMPARED_MPS, COMPARED_MOST_MPS = 0.2, 1.2, 12.5
+#: and faster than this: slower, a sensor that is off by a few tenths of a m/s would look like one that is wrong by a
+#: factor, and beyond the last speed one that is off by 5 m/s, where the wheels are believed.
+COMPARED_S, COMPARED_MPS, COMPARED_MOST_MPS = 0.2, 2.0, 12.5
 
 
 class Rolling(NamedTuple):
