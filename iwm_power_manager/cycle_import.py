@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iwm_power_manager.cycle import MAX_GRADE, MAX_SAMPLES, Cycle, at_rest, make_cycle
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.tables import Table, read_table
+from iwm_power_manager.tables import Table, is_nothing, read_table
 from iwm_power_manager.trace_units import SPEED_UNITS, TIME_UNITS, FloatArray, implausible, likely_units
 
 #: At a cut, the speed goes from one piece's end to the next one's start at this, m/s2.
@@ -134,7 +134,7 @@ def read_log(
             problem = f"has {len(cells)} values: decimal commas between commas?"
             raise ConfigError(path, f"line {line}", problem, f"{len(header)}, as in the header")
         row = {name: cells[i] if i < len(cells) else "" for name, i in columns.items()}
-        if any(map(_is_nothing, row.values())):
+        if any(map(is_nothing, row.values())):
             left_out += 1
             continue
         for name, text in row.items():
@@ -200,15 +200,11 @@ def _column(
     One that is empty is the last choice.
     """
     wanted = [i for i, cell in enumerate(header) if (cell == name if name else re.search(pattern, cell, re.IGNORECASE))]
-    wanted.sort(key=lambda i: (all(map(_is_nothing, _cells(table, i))), not _named(header[i], units or {})))
+    wanted.sort(key=lambda i: (all(map(is_nothing, _cells(table, i))), not _named(header[i], units or {})))
     if not wanted:
         problem = f"has no column {name!r}" if name else f"has no column that looks like {what}: name it with --{what}"
         raise ConfigError(table.path, "line 1", problem, ", ".join(header))
     return wanted[0]
-
-
-def _is_nothing(text: str) -> bool:
-    return text.lower() in ("", "nan", "null", "none", "-", "n/a", "na")
 
 
 def _cells(table: Table, column: int) -> list[str]:

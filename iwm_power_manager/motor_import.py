@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 from iwm_power_manager.errors import ConfigError, one_line
 from iwm_power_manager.motor_map import COLUMNS, RANGES
-from iwm_power_manager.tables import Table, read_table
+from iwm_power_manager.tables import Table, is_nothing, read_table
 
 RAD_S_PER_RPM = 2.0 * math.pi / 60.0
 _SPEED_NAMES = {"rpm": r"\brpm|1/min|min-1|min\^-1|u/min", "rad/s": r"rad ?/?s\b|rad ?per ?s|radps"}
-_NOTHING = ("", "nan", "-", "n/a", "na", "null", "none", "inf", "n.a.", "k.a.")
 #: Units that are not read, by what the option that settles it is.
 _OTHER_UNITS = {
     "speeds": (r"km[/ ]?h\b|\b[km]ph|\bm/s|\bkrpm|\brps|\b1/s|\bs\^?-1|\bhz\b|(deg|°)/s", "rad/s or rpm: --speed-unit"),
@@ -180,8 +179,7 @@ def _check_quantity(path: Path | str, header: list[str], quantity: str) -> None:
 
 
 def _value(table: Table, line: int, text: str, column: str) -> float:
-    nothing = text.lower() in _NOTHING or text.startswith("#")  # a spreadsheet's errors
-    return math.nan if nothing else table.number(line, text, column)
+    return math.nan if is_nothing(text) or text.lower() == "inf" else table.number(line, text, column)
 
 
 def _list(table: Table, said: list[str]) -> list[tuple[int, float, float, float]]:

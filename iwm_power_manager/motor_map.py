@@ -27,6 +27,8 @@ MAX_AXIS_POINTS = 1000
 MAX_POINTS = 200_000
 #: A map that ends this little before the motor's limit reaches it: its edge holds there.
 REACH_TOLERANCE = 0.02
+#: No car's motor loses more, W: such an efficiency is an error of its table.
+_MOST_LOSS_W = 1e9
 
 
 class MotorMap(NamedTuple):
@@ -142,9 +144,13 @@ def map_of(path: Path | str, efficiency: dict[tuple[float, float], float]) -> Mo
     for (s, t), eta in efficiency.items():
         given[row[s], column[t]] = eta
     power = speeds[:, None] * torques
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         loss = np.where(power > 0.0, power / given - power, -power * (1.0 - given))
     loss[~(given > 0.0) & ~((given == 0.0) & _brings_nothing(power, given)) | (power == 0.0)] = np.nan
+    for i, j in np.argwhere(loss > _MOST_LOSS_W)[:1]:
+        where = f"speed {speeds[i]:g} rad/s, torque {torques[j]:g} N m"
+        problem = f"efficiency {given[i, j]:g} means a loss of {loss[i, j]:g} W"
+        raise ConfigError(path, where, problem, f"up to {_MOST_LOSS_W:g} W; nothing, or 0, where it is not known")
     if np.all(np.isnan(loss)):
         raise ConfigError(path, "", "has no efficiency above 0 where speed and torque are not 0")
     return MotorMap(speeds, torques, loss)

@@ -21,6 +21,15 @@ _STATED = re.compile(r"\ufeff?sep=([;,|\t])\s*")
 _THOUSANDS = re.compile(r"[-+]?[0-9]{1,3}(\.[0-9]{3})+(,[0-9]+)?")
 
 
+#: What people and programs write where there is no value.
+_NOTHING = ("", "nan", "-", "--", "n/a", "na", "null", "none", "n.a.", "k.a.")
+
+
+def is_nothing(cell: str) -> bool:
+    """Whether a cell says that there is no value; those that begin with # are a spreadsheet's errors."""
+    return cell.lower() in _NOTHING or cell.startswith("#")
+
+
 class Table(NamedTuple):
     """Cells of a table, stripped, with the line each row stands in; `decimal` is "." or ","."""
 

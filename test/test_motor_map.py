@@ -152,6 +152,14 @@ def test_what_stands_at_zero_torque_or_speed_is_ignored(tmp_path, text):
     assert np.array_equal(np.delete(loss[1:], 3, axis=1), plain[2])
 
 
+@pytest.mark.parametrize("eta", ["1e-320", "1e-300", "1e-9"])
+@pytest.mark.filterwarnings("error")
+def test_an_efficiency_whose_loss_no_motor_has_is_named(tmp_path, eta):
+    path = write(tmp_path, "10,-20,0.5", "10,20,0.8", "50,-20,0.7", f"50,20,{eta}")
+    with pytest.raises(ConfigError, match=r"map\.csv: speed 50 rad/s, torque 20 N m: efficiency .* means a loss of"):
+        read_map(path)
+
+
 @pytest.mark.parametrize("outside", [(), ("100,100,",), ("100,100,nan",), ("100,100,0",)])
 def test_points_a_motor_cannot_reach_may_be_missing_empty_nan_or_zero(tmp_path, outside):
     path = write(tmp_path, *KNOWN, "100,50,0.8667", *outside)

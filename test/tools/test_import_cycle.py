@@ -75,6 +75,16 @@ def test_units_in_a_line_of_their_own_and_a_stated_separator_are_read(tmp_path, 
     np.testing.assert_allclose(load_cycle(tmp_path / "trip.csv").speed_mps, np.arange(10.0), atol=0.03)
 
 
+@pytest.mark.parametrize("nothing", ["#N/A", "#NV", "#DIV/0!", "n.a.", "--", "NA", "NaN", ""])
+def test_what_says_that_there_is_no_value_leaves_its_row_out(tmp_path, capsys, nothing):
+    rows = [(t, 3.6 * t) for t in range(10)]
+    rows[4] = (4, nothing)
+    log = log_of(tmp_path / "log.csv", ("t [s]", "v [km/h]"), rows)
+    code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv")
+    assert code == 0
+    assert "1 rows without a value left out" in out
+
+
 def test_a_column_of_time_that_is_empty_is_the_last_choice(tmp_path, capsys):
     rows = [("-", t, 3.6 * t) for t in range(10)]
     log = log_of(tmp_path / "log.csv", ("GPS Time", "Device Time", "Speed (km/h)"), rows)
