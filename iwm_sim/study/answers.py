@@ -110,7 +110,7 @@ def _better(study: Study) -> str:
     met = sum(criterion.met for criterion in study.criteria)
     return (
         f"Against equal split, our policy saves {' and '.join(parts)}, at {changes:.1f} changes of the split a minute "
-        f"at most; {met} of {len(study.criteria)} criteria are met. {_rival(study)}"
+        f"at most; {met} of the study's {len(study.criteria)} criteria are met. {_rival(study)}"
     )
 
 
@@ -125,7 +125,7 @@ def _rival(study: Study) -> str:
     if not better:
         return "No simple rival is ahead anywhere."
     return (
-        f"A blind search for the least power now, free to change as often as it likes, is ahead in {len(better)} of "
+        f"A blind search for the least power now (`instantaneous`), free to change as often as it likes, is ahead in {len(better)} of "
         f"{len(ahead)} cells by up to {max(better):.2f} points and behind by up to {-min(ahead):.2f} in the others."
     )
 
