@@ -188,6 +188,15 @@ def topic_counts(files: Iterable[tuple[Mapping[int, Topic], Mapping[int, int]]])
     return counts
 
 
+def typed(topic: Topic, information: Mapping[str, Any]) -> Topic:
+    """A topic with its type: where the file has no schema for it, the one that a `metadata.yaml` states."""
+    entries: Any = information.get("topics_with_message_count")
+    if topic.type or _wrong_key(entries, _KINDS["topics_with_message_count"], "topics"):
+        return topic
+    listed = {entry["topic_metadata"]["name"]: entry["topic_metadata"]["type"] for entry in entries}
+    return topic._replace(type=listed.get(topic.name, ""))
+
+
 def miscounted(information: Mapping[str, Any], topics: Mapping[str, int]) -> bool:
     """Whether a `metadata.yaml` without another problem states other numbers of messages than the files hold."""
     entries = information["topics_with_message_count"]

@@ -20,7 +20,15 @@ from typing import Any, NamedTuple, Self
 
 from iwm_power_manager.bags.limits import PACKED, ZSTD_MAGIC, check_exists, decompress, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_source import MAGIC, McapSource
-from iwm_power_manager.bags.metadata import METADATA_FILE, Topic, miscounted, read_metadata, text_values, topic_counts
+from iwm_power_manager.bags.metadata import (
+    METADATA_FILE,
+    Topic,
+    miscounted,
+    read_metadata,
+    text_values,
+    topic_counts,
+    typed,
+)
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError
 
@@ -152,8 +160,9 @@ class BagReader:
 
     def _take(self, source: Source) -> None:
         """What a file knows of topics, counts and custom data."""
-        names = self._names[source] = {number: self._name(topic) for number, topic in source.topics().items()}
-        for number, topic in source.topics().items():
+        topics = {number: typed(topic, self.information) for number, topic in source.topics().items()}
+        names = self._names[source] = {number: self._name(topic) for number, topic in topics.items()}
+        for number, topic in topics.items():
             self.counts[names[number]] += source.counts[number]
             if topic.definition or names[number] not in self.topics:
                 self.topics[names[number]] = topic

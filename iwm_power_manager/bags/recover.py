@@ -35,6 +35,7 @@ from iwm_power_manager.bags.metadata import (
     read_metadata,
     text_values,
     topic_counts,
+    typed,
 )
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
@@ -391,7 +392,7 @@ def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Ma
             known = source.information.get("ros_distro") or source.metadata.get("rosbag2", {}).get("ROS_DISTRO")
             distro = distro or str(known or ("" if _is_own(source) else "unknown"))
         for topic in file.seen.topics.values():
-            topics.setdefault(topic.name, topic)
+            topics.setdefault(topic.name, typed(topic, recorded))
     information = bag_information(
         storage,
         [

@@ -471,3 +471,20 @@ def test_definitions_that_a_database_holds_as_bytes_are_read(tmp_path: Path) -> 
     with BagReader(folder) as reader:
         topic = reader.topics[foreign.SPEED.topic]
     assert (topic.definition, topic.encoding) == (foreign.SPEED.text, "ros2msg")
+
+
+def test_the_types_of_channels_without_a_schema_are_those_that_metadata_states(tmp_path: Path) -> None:
+    channels = b"".join(
+        foreign.record(Channel(i, channel.topic, "cdr", {}, 0)) for i, channel in enumerate(foreign.CHANNELS, 1)
+    )
+    kept = foreign.chunk(foreign.message_records(foreign.drive(5)))
+    path = foreign.write_records(tmp_path / "bag" / "a_0.mcap", channels, kept)
+    path.write_bytes(path.read_bytes()[:-20])
+    foreign.write_metadata(path.parent)
+    stated = {channel.topic: channel.type for channel in foreign.CHANNELS}
+    with BagReader(path.parent) as reader:
+        assert {name: topic.type for name, topic in reader.topics.items()} == stated
+    assert recover(path.parent).files[0].rebuilt
+    with BagReader(path.parent) as reader:
+        assert {name: topic.type for name, topic in reader.topics.items()} == stated
+        assert reader.damage == []
