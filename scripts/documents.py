@@ -263,8 +263,9 @@ def unseen_kinds(found: dict[str, Any]) -> str:
         f"{found['alone']} ({found['alone_drawn']} of them drawn cars) every rival changes more often, so that only "
         "equal split is left and the margin is our whole saving. Ours is at most "
         f"{unseen.CLOSE:g} points behind in {100 * found['verdicts'][0]['part_close']:.1f} % of the cells. With a "
-        f"budget of 8 changes a minute, {100 * found['part_above_10']:.0f} % of the drives, which are short, have more than 10 changes "
-        f"a minute, at most {found['most_changes_per_min']:.1f}; the busiest minute has {found['busiest_minute']}."
+        f"budget of 8 changes a minute, {100 * found['part_above_10']:.0f} % of the drives, which are short, have more "
+        f"than 10 changes a minute, at most {found['most_changes_per_min']:.1f}; the busiest minute "
+        f"has {found['busiest_minute']}."
     )
 
 

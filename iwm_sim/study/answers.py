@@ -125,8 +125,9 @@ def _rival(study: Study) -> str:
     if not better:
         return "No simple rival is ahead anywhere."
     return (
-        f"A blind search for the least power now (`instantaneous`), free to change as often as it likes, is ahead in {len(better)} of "
-        f"{len(ahead)} cells by up to {max(better):.2f} points and behind by up to {-min(ahead):.2f} in the others."
+        "A blind search for the least power now (`instantaneous`), free to change as often as it likes, is ahead in "
+        f"{len(better)} of {len(ahead)} cells by up to {max(better):.2f} points and behind by up to {-min(ahead):.2f} "
+        "in the others."
     )
 
 
