@@ -392,7 +392,7 @@ def faults_table() -> str:
         Column("zero torque after", lambda row: row["to_zero_s"], "s", 2),
         Column("torque later", lambda row: row["largest_nm"], "N m", 1),
         Column("normal again", lambda row: row["recovery_s"], "s", 2),
-        Column("reported", lambda row: row["said"].split(";")[0]),
+        Column("reported", lambda row: re.split(r";(?![^()]*\))", row["said"])[0]),
     ]
     return markdown_table(rows, columns)
 
