@@ -14,7 +14,7 @@ export ROS_LOG_DIR ?= $(CURDIR)/log/ros
 
 ##@ The two commands
 .PHONY: demo test
-demo: setup-run  ## Drive the New York City Cycle over DDS, record it, show the result (2 min; the first time also set-up, 3 min)
+demo: setup-run  ## Drive the New York City Cycle over DDS, record it, show the result (2 min; the first time also set-up, 1 to 5 min)
 	@$(BIN)/demo $(ARGS)
 
 test: lint type  ## Linters, types and all tests (20 min)
@@ -50,7 +50,7 @@ bench-peers: setup-dev  ## FASTSim in an environment of its own, runs/peers: a p
 
 ##@ Documentation
 .PHONY: docs
-docs: setup-dev  ## The pages, every --help and the API as a site: build/docs/html/index.html (2 min; the first time also set-up, 3 min)
+docs: setup-dev  ## The pages, every --help and the API as a site: build/docs/html/index.html (2 min; the first time also set-up, 1 to 5 min)
 	@$(BIN)/python scripts/docs_site $(ARGS)
 
 ##@ Safety
@@ -77,7 +77,7 @@ mutation: setup-dev  ## Mutate the same modules: do the tests notice? (an hour; 
 
 ##@ Parts
 .PHONY: setup lint type format sbom build clean setup-run setup-dev help
-setup: setup-dev  ## Only set up: .venv with everything that demo, tests, docs and watch_car need (3 min)
+setup: setup-dev  ## Only set up: .venv with everything that demo, tests, docs and watch_car need (1 to 5 min)
 
 lint: setup-dev  ## ruff: style, docstrings, likely mistakes; import-linter: the layers (1 min)
 	@$(BIN)/ruff check .

@@ -11,6 +11,6 @@ PAPER_SDP, GATE_OFF, GATE_TABLE_2 = "paper_sdp", "paper_sdp_ungated", "paper_sdp
 FREE_BOUND = "preview, changes free"
 #: What these pages call possible.
 POSSIBLE = (
-    "what preview, which knows the whole cycle, saves with our budget of changes of the split, or another strategy "
-    "with no more changes where that is more; more changes can save more"
+    "the most that any strategy saved with no more changes of the split than our budget, preview, which knows the "
+    "whole cycle in advance, among them; with more changes, more can be saved"
 )
