@@ -84,7 +84,6 @@ setup(
     data_files=shared_files(),
     install_requires=[
         "jinja2",
-        "apsw",
         "distributed",
         "lz4",
         "matplotlib",

@@ -16,18 +16,14 @@ it builds a dataclass for each, which costs more than the rest of reading (`benc
 
 from __future__ import annotations
 
-import heapq
 import mmap
 import re
 import struct
 import zlib
-from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from io import BytesIO
-from itertools import accumulate, count
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -180,10 +176,6 @@ class Definitions:
         if known.setdefault(found.id, found) != found:
             self.note(f"announces {type(found).__name__.lower()} {found.id} in more than one way: the first counts")
 
-    def schema_of(self, channel: Channel) -> Schema:
-        """A channel's schema; an empty one where there is none."""
-        return self.schemas.get(channel.schema_id) or Schema(id=0, data=b"", encoding="", name="")
-
 
 def _read(kind: Any, data: Bytes, record: Record) -> Any:
     """A record as the `mcap` package reads it; `BagError` if its content is none, or has another length."""
@@ -231,15 +223,53 @@ def split(raw: bytes, definitions: Definitions) -> list[ChannelMessage]:
 
 
 class Piece(NamedTuple):
-    """A chunk, or a stretch of messages outside of chunks: its first and last log time, and where it is."""
+    """Messages that are read at once, as a chunk is: their first and last log time, ns, and where they are."""
 
     start_ns: int
     end_ns: int
-    record: Record
+    source: Source
+    place: Any
 
 
-class McapSource:
-    """An MCAP file, opened and surveyed.
+class Source:
+    """One data file of a bag.
+
+    Attributes
+    ----------
+    path : the file
+    damage : what is wrong with the file, a line each; grows while messages are read
+    topics, counts : topic and number of messages by channel, as far as they can be read
+    pieces : all messages, in the order of the file
+    custom_data : custom metadata inside of the file, our own recorder's or rosbag2's
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage: list[str] = []
+        self.topics: dict[int, Topic] = {}
+        self.counts: Counter[int] = Counter()
+        self.pieces: list[Piece] = []
+        self.header = Header(profile="ros2", library="")
+        self.custom_data: dict[str, str] = {}
+
+    def unpack(self, piece: Piece) -> list[ChannelMessage]:
+        """Messages of a piece in the order of the file, as far as they can be read; a line of damage for others."""
+        raise NotImplementedError
+
+    def messages(self) -> Iterator[ChannelMessage]:
+        """All messages in the order of the file."""
+        for piece in self.pieces:
+            yield from self.unpack(piece)
+
+    def note(self, line: str) -> None:
+        """Add a line to the damage, if there is room for another."""
+        line = line if len(self.damage) < limits.MAX_NOTES else "is damaged at more places"
+        if line not in self.damage:
+            self.damage.append(line)
+
+
+class McapSource(Source):
+    """An MCAP file, opened and surveyed; each piece is a chunk, or a stretch of messages outside of chunks.
 
     Parameters
     ----------
@@ -248,15 +278,9 @@ class McapSource:
 
     Attributes
     ----------
-    path : the file
-    damage : what is wrong with the file, a line each; grows while messages are read
     definitions : schemas and channels
-    counts : messages by channel, as far as chunks can be read
     metadata : contents of metadata records, by name
     information : what rosbag2 keeps inside of the file of its `metadata.yaml`; {} if that is nothing or unreadable
-    custom_data : custom metadata inside of the file, our own recorder's or rosbag2's
-    start_ns, end_ns : log times of the messages; 0 if there is none
-    set_back : the clock was set back while it was recorded: its log times are no order, and the file's order counts
 
     Raises
     ------
@@ -265,14 +289,9 @@ class McapSource:
     """
 
     def __init__(self, path: Path, stack: ExitStack) -> None:
-        self.path = path
-        self.damage: list[str] = []
+        super().__init__(path)
         self.definitions = Definitions(self.note)
-        self.counts: Counter[int] = Counter()
         self.metadata: dict[str, dict[str, str]] = {}
-        self.header = Header(profile="ros2", library="")
-        self.start_ns = self.end_ns = 0
-        self._pieces: list[Piece] = []
         self._too_much_at = _NEVER  # byte from which on chunks are not unpacked
         if limits.regular_file(path) == 0:
             raise BagError(f"{path}: is empty")
@@ -283,26 +302,18 @@ class McapSource:
             raise BagError(f"{path}: cannot be read: {error.strerror or error}") from None
         begins = self.data[: len(MAGIC)] == MAGIC
         statistics = self._survey()
-        if not (begins or self._pieces):
+        if not (begins or self.pieces):
             raise BagError(f"{path}: is no MCAP file")
         self.information = information_of(self.metadata.get("rosbag2", {}).get("serialized_metadata", ""))
         own = self.metadata.get(CUSTOM_METADATA, {})
         self.custom_data = text_values(self.information.get("custom_data")) | own
         if statistics is not None and self._all_defined(statistics):
             self.counts.update(statistics.channel_message_counts)
-            self.start_ns, self.end_ns = statistics.message_start_time, statistics.message_end_time
         else:
             self._open_all()
-        self.set_back = self._was_set_back()
-
-    # --- what the file is about -------------------------------------------------------------------------------------
-
-    def topics(self) -> dict[int, Topic]:
-        """The topic of each channel."""
-        found = {}
         for number, channel in self.definitions.channels.items():
-            schema = self.definitions.schema_of(channel)
-            found[number] = Topic(
+            schema = self.definitions.schemas.get(channel.schema_id) or Schema(id=0, data=b"", encoding="", name="")
+            self.topics[number] = Topic(
                 channel.topic,
                 schema.name,
                 schema.data.decode("utf-8", "surrogateescape"),
@@ -311,9 +322,6 @@ class McapSource:
                 schema.encoding,
                 channel.message_encoding,
             )
-        return found
-
-    # --- the survey -------------------------------------------------------------------------------------------------
 
     def _survey(self) -> Statistics | None:
         """Go through all records; returns the summary's statistics, if the file was finished."""
@@ -323,7 +331,7 @@ class McapSource:
             found = record.content
             if record.opcode == Opcode.CHUNK:
                 start_ns, end_ns, size = _CHUNK_HEAD.unpack_from(self.data, record.body)
-                self._pieces.append(Piece(start_ns, end_ns, record))
+                self.pieces.append(Piece(start_ns, end_ns, self, record))
                 unpacked += size if size <= limits.MAX_CHUNK_BYTES else 0  # more is refused by itself
                 if unpacked > limits.MAX_CHUNK_BYTES + limits.MAX_RATIO * len(self.data):
                     self._too_much_at = min(self._too_much_at, record.start)
@@ -364,11 +372,11 @@ class McapSource:
     def _add_to_run(self, record: Record) -> None:
         """A message outside of chunks: the run it belongs to is read in one piece, like a chunk."""
         log_time = start_ns = end_ns = _MESSAGE.unpack_from(self.data, record.start)[4]
-        last = self._pieces[-1].record if self._pieces else None
+        last = self.pieces[-1].place if self.pieces else None
         if last and last.opcode == Opcode.MESSAGE and last.end == record.start and last.end - last.start < _RUN_BYTES:
-            start_ns, end_ns, _ = self._pieces.pop()
+            start_ns, end_ns, *_ = self.pieces.pop()
             record = last._replace(end=record.end)
-        self._pieces.append(Piece(min(start_ns, log_time), max(end_ns, log_time), record))
+        self.pieces.append(Piece(min(start_ns, log_time), max(end_ns, log_time), self, record))
 
     def _all_defined(self, statistics: Statistics) -> bool:
         """Whether what was met outside of chunks defines all topics; the definitions may stand in chunks alone."""
@@ -381,70 +389,17 @@ class McapSource:
 
     def _open_all(self) -> None:
         """Look into every chunk: channels may be announced there and nowhere else, and its head may be wrong."""
-        pieces, self._pieces = self._pieces, []
+        pieces, self.pieces = self.pieces, []
         for piece in pieces:
             messages = self.unpack(piece)
             self.counts.update(message[1] for message in messages)
             if messages:
                 times = [message[0] for message in messages]
-                self._pieces.append(Piece(min(times), max(times), piece.record))
-        self.start_ns = min((piece.start_ns for piece in self._pieces), default=0)
-        self.end_ns = max((piece.end_ns for piece in self._pieces), default=0)
-
-    def _was_set_back(self) -> bool:
-        """Whether the log times of a channel go back; where chunks follow each other in time, none is opened to see."""
-        filled = [piece for piece in self._pieces if piece.end_ns]  # one without messages has no times
-        ends = accumulate((piece.end_ns for piece in filled), max)
-        jumps = any(after.start_ns < end - limits.SET_BACK_NS for end, after in zip(ends, filled[1:], strict=False))
-        alone = len(filled) == 1 and filled[0].end_ns - filled[0].start_ns > limits.SET_BACK_NS
-        if not (jumps or alone):
-            return False
-        newest: dict[int, int] = {}
-        for piece in filled:
-            for log_time, channel, *_ in self.unpack(piece):
-                if log_time < newest.setdefault(channel, log_time) - limits.SET_BACK_NS:
-                    return True
-                newest[channel] = log_time
-        return False
-
-    def note(self, line: str) -> None:
-        """Add a line to the damage, if there is room for another."""
-        line = line if len(self.damage) < limits.MAX_NOTES else "is damaged at more places"
-        if line not in self.damage:
-            self.damage.append(line)
-
-    # --- messages ---------------------------------------------------------------------------------------------------
-
-    def messages(self) -> Iterator[ChannelMessage]:
-        """All messages in the order of their log times; equal times, and a clock set back, keep the order of the file.
-
-        Memory: a chunk, and of those before it the messages that belong behind its first.
-        """
-        if self.set_back:
-            for piece in self._pieces:
-                yield from self.unpack(piece)
-            return
-        pieces = sorted(self._pieces, key=itemgetter(0))
-        waiting: list[tuple[int, int, ChannelMessage]] = []
-        order, size = count(), 0
-        for piece, next_ns in zip(pieces, [*(piece.start_ns for piece in pieces[1:]), _NEVER], strict=False):
-            messages = sorted(self.unpack(piece), key=itemgetter(0))
-            ready = 0 if waiting else bisect_right(messages, next_ns, key=itemgetter(0))
-            yield from messages[:ready]
-            for message in messages[ready:]:
-                size += len(message[2]) + limits.MESSAGE_OVERHEAD_BYTES
-                heapq.heappush(waiting, (message[0], next(order), message))
-            if size > limits.MAX_OVERLAP_BYTES:
-                self.note("its chunks overlap in time by more than fits into memory: not all is in order")
-                next_ns = _NEVER
-            while waiting and waiting[0][0] <= next_ns:
-                message = heapq.heappop(waiting)[2]
-                size -= len(message[2]) + limits.MESSAGE_OVERHEAD_BYTES
-                yield message
+                self.pieces.append(Piece(min(times), max(times), self, piece.place))
 
     def unpack(self, piece: Piece) -> list[ChannelMessage]:
-        """Messages of a chunk in the order of the file; none, and a line of damage, if it cannot be unpacked."""
-        record = piece.record
+        """Messages of a chunk; none if it is damaged, or too large."""
+        record: Record = piece.place
         try:
             check_whole(self.data)
             return split(

@@ -10,16 +10,21 @@ from __future__ import annotations
 
 import heapq
 import os
+import re
 import tempfile
+from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from itertools import pairwise
+from functools import lru_cache
+from itertools import accumulate, count
+from operator import itemgetter
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
+from iwm_power_manager.bags import limits
 from iwm_power_manager.bags.limits import PACKED, ZSTD_MAGIC, check_exists, decompress, decompress_file, regular_file
-from iwm_power_manager.bags.mcap_source import MAGIC, McapSource
+from iwm_power_manager.bags.mcap_source import MAGIC, ChannelMessage, McapSource, Piece, Source
 from iwm_power_manager.bags.metadata import (
     METADATA_FILE,
     Topic,
@@ -32,11 +37,11 @@ from iwm_power_manager.bags.metadata import (
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError
 
-Source = McapSource | SqliteSource
-
 SUFFIXES = (".mcap", ".db3")
 COMPRESSED_SUFFIX = ".zstd"
 _SQLITE_MAGIC = b"SQLite format 3\0"
+_NEVER = 2**64
+_DIGITS = re.compile(r"\d+")
 MISNAMED = "is compressed, which its name does not say"
 
 
@@ -100,15 +105,21 @@ class BagReader:
         self._kinds: dict[str, dict[tuple[str, str], str]] = {}
         self.counts: Counter[str] = Counter()
         self.custom_data = text_values(self.information.get("custom_data"))
+        self._pieces = [piece for source in self.sources for piece in source.pieces]
+        self._unpack = lru_cache(maxsize=1)(_unpacked)  # to look at the first messages is no work done twice
         for source in self.sources:
             self._take(source)
+        self._set_back = self._where_set_back()
+        if self._set_back:
+            self.notes.append(
+                f"{self._set_back.path}: the clock was set back meanwhile: it is read in the order of recording"
+            )
         if self.information and not self.damage:
-            held = topic_counts((source.topics(), source.counts) for source in self.sources)
+            held = topic_counts((source.topics, source.counts) for source in self.sources)
             if miscounted(self.information, held):
                 self.notes.append(f"{self.path}: metadata.yaml miscounts the messages: {held.total()} are there")
-        filled = [source for source in self.sources if source.counts.total()]
-        self.start_ns = min((source.start_ns for source in filled), default=0)
-        self.end_ns = max((source.end_ns for source in filled), default=0)
+        self.start_ns = min((piece.start_ns for piece in self._pieces if piece.end_ns), default=0)
+        self.end_ns = max((piece.end_ns for piece in self._pieces), default=0)
 
     def __enter__(self) -> Self:
         return self
@@ -127,40 +138,73 @@ class BagReader:
 
     def messages(self) -> Iterator[Message]:
         """All messages in the order of log times; equal times, or a clock that was set back, keep that of recording."""
-        set_back = any(source.set_back for source in self.sources)
-        sources = self.sources if set_back else sorted(self.sources, key=lambda source: source.start_ns)
-        overlap = not set_back and any(after.start_ns <= before.end_ns for before, after in pairwise(sources))
-        streams = [self._messages_of(source) for source in sources]
-        if overlap:
-            yield from heapq.merge(*streams, key=lambda message: message.log_time_ns)
-            return
-        for stream in streams:
-            yield from stream
+        lost: Counter[tuple[Source, str]] = Counter()
+        for source, messages in self._in_order():
+            names = self._names[source]
+            for log_time, channel, data, publish_time, sequence in messages:
+                name = names.get(channel)
+                if name is None:
+                    lost[source, "message(s) belong to channels that are nowhere announced"] += 1
+                    continue
+                if data[:4] in PACKED:  # compression mode "message"
+                    try:
+                        data = decompress(PACKED[data[:4]], data)
+                    except BagError:  # stays as it is; decoders refuse and count it
+                        lost[source, "compressed message(s) cannot be decompressed"] += 1
+                yield Message(log_time, name, data, publish_time, sequence)
+        for (source, what), number in lost.items():
+            source.note(f"{number} {what}")
 
-    def _messages_of(self, source: Source) -> Iterator[Message]:
-        names = self._names[source]
-        homeless = unpackable = 0
-        for log_time, channel, data, publish_time, sequence in source.messages():
-            name = names.get(channel)
-            if name is None:
-                homeless += 1
-                continue
-            if data[:4] in PACKED:  # compression mode "message"
-                try:
-                    data = decompress(PACKED[data[:4]], data)
-                except BagError:
-                    unpackable += 1  # stays as it is; decoders refuse and count it
-            yield Message(log_time, name, data, publish_time, sequence)
-        if homeless:
-            source.note(f"{homeless} message(s) belong to channels that are nowhere announced")
-        if unpackable:
-            source.note(f"{unpackable} compressed message(s) cannot be decompressed")
+    def _in_order(self) -> Iterator[tuple[Source, Sequence[ChannelMessage]]]:
+        """The messages in their order, as many at a time as one file has next.
+
+        Memory: a piece, such as a chunk, and of those before it the messages that belong behind its first.
+        """
+        if self._set_back:
+            yield from ((piece.source, self._unpack(piece)) for piece in self._pieces)
+            return
+        pieces = sorted(self._pieces, key=itemgetter(0))
+        waiting: list[tuple[int, int, ChannelMessage, Source]] = []
+        order, size = count(), 0
+        for piece, next_ns in zip(pieces, [*(piece.start_ns for piece in pieces[1:]), _NEVER], strict=False):
+            messages = sorted(self._unpack(piece), key=itemgetter(0))
+            ready = 0 if waiting else bisect_right(messages, next_ns, key=itemgetter(0))
+            yield piece.source, messages[:ready]
+            for message in messages[ready:]:
+                size += len(message[2]) + limits.MESSAGE_OVERHEAD_BYTES
+                heapq.heappush(waiting, (message[0], next(order), message, piece.source))
+            if size > limits.MAX_OVERLAP_BYTES:
+                piece.source.note("its chunks overlap in time by more than fits into memory: not all is in order")
+                next_ns = _NEVER
+            while waiting and waiting[0][0] <= next_ns:
+                *_, message, source = heapq.heappop(waiting)
+                size -= len(message[2]) + limits.MESSAGE_OVERHEAD_BYTES
+                yield source, [message]
+
+    def _where_set_back(self) -> Source | None:
+        """The file in which the log times of a topic go back, or with which they do among files of one series.
+
+        Where pieces follow each other in time, none is read to see.
+        """
+        filled = [piece for piece in self._pieces if piece.end_ns]  # one without messages has no times
+        ends = accumulate((piece.end_ns for piece in filled), max)
+        jumps = any(after.start_ns < end - limits.SET_BACK_NS for end, after in zip(ends, filled[1:], strict=False))
+        alone = len(filled) == 1 and filled[0].end_ns - filled[0].start_ns > limits.SET_BACK_NS
+        newest: dict[tuple[str, str | None], int] = {}
+        for piece in filled if jumps or alone else ():
+            series, names = _DIGITS.sub("", piece.source.path.name), self._names[piece.source]
+            for log_time, channel, *_ in self._unpack(piece):
+                topic = series, names.get(channel)
+                if log_time < newest.setdefault(topic, log_time) - limits.SET_BACK_NS:
+                    return piece.source
+                newest[topic] = log_time
+        return None
 
     # --- opening ----------------------------------------------------------------------------------------------------
 
     def _take(self, source: Source) -> None:
         """What a file knows of topics, counts and custom data."""
-        topics = {number: typed(topic, self.information) for number, topic in source.topics().items()}
+        topics = {number: typed(topic, self.information) for number, topic in source.topics.items()}
         names = self._names[source] = {number: self._name(topic) for number, topic in topics.items()}
         for number, topic in topics.items():
             self.counts[names[number]] += source.counts[number]
@@ -168,8 +212,6 @@ class BagReader:
                 self.topics[names[number]] = topic
             if names[number] != topic.name:
                 self.notes.append(f"{topic.name} has more than one definition: each message is read by its own")
-        if source.set_back:
-            self.notes.append(f"{source.path}: the clock was set back meanwhile: it is read in the order of recording")
         self.custom_data = source.custom_data | self.custom_data
 
     def _name(self, topic: Topic) -> str:
@@ -193,6 +235,7 @@ class BagReader:
                 problems.append(str(error))
         if not self.sources:
             raise BagError(problems[0] if problems else f"{self.path}: holds no .mcap or .db3 file")
+        self.sources.sort(key=lambda source: _recording_order(source.path))
         self._damage += problems
 
     def _file_names(self) -> list[Path]:
@@ -209,6 +252,10 @@ class BagReader:
             left_out = [name for name in there if name not in known and begins_as_data(name, self.path)]
             self.notes += [f"{name}: is not in metadata.yaml and left out" for name in left_out]
         return present
+
+
+def _unpacked(piece: Piece) -> list[ChannelMessage]:
+    return piece.source.unpack(piece)
 
 
 def recovered(path: Path) -> Path:

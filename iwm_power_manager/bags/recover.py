@@ -205,9 +205,9 @@ class _Gaps:
 class _Seen:
     """All messages of a file, read and counted: by channel, in all, the first and the last, compressed one by one."""
 
-    def __init__(self, source: reader.Source, gaps: _Gaps) -> None:
+    def __init__(self, source: mcap_source.Source, gaps: _Gaps) -> None:
         self.source = source
-        self.topics = source.topics()
+        self.topics = source.topics
         self.counts: Counter[int] = Counter()
         self.compression = ""
         self.start_ns, self.end_ns = 2**64, 0
@@ -285,7 +285,7 @@ def _free_name(path: Path) -> str:
     return next(name for name in names if not os.path.lexists(path.with_name(name)))
 
 
-def _is_own(source: reader.Source) -> bool:
+def _is_own(source: mcap_source.Source) -> bool:
     return source.header.library.startswith(LIBRARY.partition(" ")[0])
 
 
@@ -312,20 +312,20 @@ class _Copy:
     torn : bytes at its end
     """
 
-    def __init__(self, source: reader.Source, target: Path) -> None:
+    def __init__(self, source: mcap_source.Source, target: Path) -> None:
         self.lost = self.torn = 0
         self._file = McapFile(target, library=source.header.library or LIBRARY, profile=source.header.profile)
         self._numbers: dict[int, int] = {}  # by the channels of the old file those of the new one
         self._schemas: dict[int, Schema] = {}
         self._made: dict[str, int] = {}
         try:
-            if isinstance(source, SqliteSource):
-                self._numbers |= {number: announce(self._file, topic) for number, topic in source.topics().items()}
-                self._write(source.messages())
-            else:
+            if isinstance(source, mcap_source.McapSource):
                 self._define(source.definitions)
                 for record in source.records():
                     self._carry_over(source, record)
+            else:
+                self._numbers |= {number: announce(self._file, topic) for number, topic in source.topics.items()}
+                self._write(source.messages())
             self._file.finish()
         finally:
             self._file.abandon()

@@ -1,30 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of one rosbag2 sqlite3 file: by rosbags where it is whole, row by row where it is damaged.
+"""Messages of one rosbag2 sqlite3 file, whole or damaged, in pieces as those of an MCAP file are.
 
 rosbags refuses a database whose end is missing, asks for as much time as a query wants, and makes an address of the
 file's name (`Sqlite3Reader` in
-https://gitlab.com/ternaris/rosbags/-/blob/master/src/rosbags/rosbag2/storage_sqlite3.py). So the file is looked at
-first: read-only and immutable; what it defines may not run, and a bound on sqlite's own instructions ends a query that
-does not.
+https://gitlab.com/ternaris/rosbags/-/blob/master/src/rosbags/rosbag2/storage_sqlite3.py). Here the file is opened
+read-only and immutable, what it defines may not run, and a query that does not end is ended: by a bound on sqlite's own
+instructions.
 """
 
 from __future__ import annotations
 
-import re
 import sqlite3
-from collections import Counter
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import apsw
-from mcap.records import Header
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-
 from iwm_power_manager.bags import limits
-from iwm_power_manager.bags.mcap_source import ChannelMessage
+from iwm_power_manager.bags.mcap_source import ChannelMessage, Piece, Source
 from iwm_power_manager.bags.metadata import Topic, parse_qos
 from iwm_power_manager.errors import BagError
 
@@ -34,39 +26,23 @@ _TABLES = """
     SELECT name FROM sqlite_master AS found WHERE type = 'table' AND rootpage > 0
     AND NOT EXISTS (SELECT 1 FROM pragma_table_xinfo(found.name) WHERE hidden <> 0)
 """
-_BY_TIME = "SELECT topic_id, timestamp, data FROM messages ORDER BY timestamp, rowid"
-_AS_RECORDED = "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"
-#: Times are whole numbers of nanoseconds, or the same with a decimal point.
-_TIMED = "typeof(timestamp) IN ('integer', 'real') AND timestamp BETWEEN 0 AND 9223372036854775807"
-_COUNTS = f"""
-    SELECT topic_id, count(*), min(timestamp), max(timestamp), total(typeof(data) <> 'blob')
-    FROM messages WHERE {_TIMED} GROUP BY topic_id
-"""  # noqa: S608 - constants
-#: Whether any time goes back, which takes a tenth of the time of asking topic by topic.
-_GOES_BACK = f"""
-    SELECT 1 FROM messages AS one JOIN messages AS next ON next.rowid = one.rowid + 1
-    WHERE next.timestamp < one.timestamp - {limits.SET_BACK_NS} LIMIT 1
-"""  # noqa: S608 - constants
-_SET_BACK = f"""
-    SELECT 1 FROM (
-        SELECT timestamp - lag(timestamp) OVER (PARTITION BY topic_id ORDER BY rowid) AS step
-        FROM messages WHERE {_TIMED}
-    ) WHERE step < -{limits.SET_BACK_NS} LIMIT 1
-"""  # noqa: S608 - constants
+#: Messages are bytes of a topic at a time: a whole number of nanoseconds, or the same with a decimal point.
+_ROWS = """
+    SELECT rowid, topic_id, CAST(timestamp AS INTEGER), {} FROM messages
+    WHERE typeof(topic_id) = 'integer' AND typeof(data) = 'blob' AND typeof(timestamp) IN ('integer', 'real')
+    AND +timestamp BETWEEN 0 AND 9223372036854775807 AND rowid BETWEEN ? AND ? ORDER BY rowid
+"""
+_FIRST, _LAST = -(2**63), 2**63 - 1
+#: Messages are read in pieces of about this size.
+_PIECE_BYTES = 1024 * 1024
+_ERRORS = (sqlite3.Error, OverflowError, MemoryError)
 
 
-class SqliteSource:
-    """A rosbag2 sqlite3 file. Attributes as those of `mcap_source.McapSource`, where a topic's id is its channel."""
+class SqliteSource(Source):
+    """A rosbag2 sqlite3 file, where a topic's id is its channel; a piece is a range of rows."""
 
     def __init__(self, path: Path, stack: ExitStack) -> None:
-        self.path = path
-        self.damage: list[str] = []
-        self.counts: Counter[int] = Counter()
-        self.start_ns = self.end_ns = 0
-        self.header = Header(profile="ros2", library="")
-        self.custom_data: dict[str, str] = {}  # there is none in these files
-        self._topics: dict[int, Topic] = {}
-        self._plain = True  # the data is bytes in each row: rosbags fails at others
+        super().__init__(path)
         self._steps = (
             limits.SQLITE_INSTRUCTIONS + limits.SQLITE_INSTRUCTIONS_PER_BYTE * limits.regular_file(path)
         ) // _STEP
@@ -85,55 +61,21 @@ class SqliteSource:
                 raise BagError(f"{path}: is no rosbag2 sqlite3 bag")
             self._definitions = self._read_definitions() if "message_definitions" in tables else {}
             self._read_topics()
-        except (sqlite3.Error, ValueError, OverflowError, MemoryError) as error:
+        except (*_ERRORS, ValueError) as error:
             raise BagError(f"{path}: is no readable sqlite3 bag: {_one_line(error)}") from None
         except KeyError as error:
             raise BagError(f"{path}: is no rosbag2 sqlite3 bag: its topics have no {error}") from None
-        self.set_back = False
-        self._count()
-        self._reader = self._rosbags_reader(stack) if self._plain and not (self.damage or self.set_back) else None
+        self._survey()
 
-    def topics(self) -> dict[int, Topic]:
-        """The topic of each id."""
-        return self._topics
-
-    def messages(self) -> Iterator[ChannelMessage]:
-        """All messages in the order of log times, or of recording: of a damaged file, or if the clock was set back."""
-        bad = 0
+    def unpack(self, piece: Piece) -> list[ChannelMessage]:
+        """Messages of a range of rows up to one that cannot be read."""
+        messages: list[ChannelMessage] = []
         try:
-            for number, log_time, data in self._rows():
-                timed = type(log_time) in (int, float) and 0 <= log_time < 2**63
-                if timed and type(data) is bytes and type(number) is int:
-                    yield (time_ns := int(log_time)), number, data, time_ns, 0
-                else:
-                    bad += 1
-        except (sqlite3.Error, apsw.Error, OverflowError, MemoryError) as error:
+            for _, number, log_time, data in self._database.execute(_ROWS.format("data"), piece.place):
+                messages.append((log_time, number, data, log_time, 0))
+        except _ERRORS as error:
             self.note(f"is not readable to its end: {_one_line(error)}")
-        if bad:
-            self.note(f"{bad} row(s) hold no message of a known topic")
-
-    def _rows(self) -> Iterator[tuple[Any, Any, Any]]:
-        if self._reader is not None:
-            for connection, log_time, data in self._reader.messages(self._reader.connections):
-                yield connection.id, log_time, data
-        else:
-            yield from self._database.execute(_AS_RECORDED if self.damage or self.set_back else _BY_TIME)
-
-    def _rosbags_reader(self, stack: ExitStack) -> Sqlite3Reader | None:
-        """The reader of rosbags, if it takes this file: its queries end after so many instructions, too."""
-        if re.search(r"[?#%]", str(self.path)):
-            return None
-        reader = Sqlite3Reader(self.path)
-        bound = partial(apsw.Connection.set_progress_handler, callable=self._out_of_steps, nsteps=_STEP)
-        apsw.connection_hooks.append(bound)
-        try:
-            reader.open()
-        except Exception:  # noqa: BLE001 - whatever it makes of other people's tables
-            return None
-        finally:
-            apsw.connection_hooks.remove(bound)
-        stack.callback(reader.close)
-        return reader
+        return messages
 
     def _out_of_steps(self) -> bool:
         self._steps -= 1
@@ -159,10 +101,10 @@ class SqliteSource:
             name, msgtype, serialization = map(str, described)
             encoding, text = self._definitions.get(msgtype, ("", ""))
             type_hash, qos = (str(found.get(key) or "") for key in ("type_description_hash", "offered_qos_profiles"))
-            self._topics[found["id"]] = Topic(name, msgtype, text, type_hash, parse_qos(qos), encoding, serialization)
+            self.topics[found["id"]] = Topic(name, msgtype, text, type_hash, parse_qos(qos), encoding, serialization)
 
-    def _count(self) -> None:
-        """Messages by topic, if the file is whole: each page of it is looked at."""
+    def _survey(self) -> None:
+        """Look at each page, and divide the messages into pieces."""
         try:
             pages = self._database.execute("SELECT page_size * page_count FROM pragma_page_size, pragma_page_count")
             if pages.fetchone()[0] > limits.regular_file(self.path):
@@ -170,20 +112,21 @@ class SqliteSource:
             (problem,) = self._database.execute("PRAGMA quick_check(1)").fetchone()
             if problem != "ok":
                 self.note(f"is damaged: {' '.join(problem.split())}")
-            for number, count, start_ns, end_ns, odd in self._database.execute(_COUNTS):
-                self._plain = self._plain and not odd and number in self._topics
-                self.start_ns = min(self.start_ns, int(start_ns)) if self.counts else int(start_ns)
-                self.end_ns = max(self.end_ns, int(end_ns))
-                self.counts[number] = count
-            self.set_back = all(self._database.execute(query).fetchone() for query in (_GOES_BACK, _SET_BACK))
-        except sqlite3.Error as error:
-            self.note(f"is damaged: {_one_line(error)}")
-            self.counts.clear()
-
-    def note(self, line: str) -> None:
-        """Add a line to the damage."""
-        if line not in self.damage:
-            self.damage.append(line)
+            size = _PIECE_BYTES
+            for row, number, log_time, length in self._database.execute(_ROWS.format("length(data)"), (_FIRST, _LAST)):
+                self.counts[number] += 1
+                first, start_ns, end_ns = row, log_time, log_time
+                if size < _PIECE_BYTES:
+                    start_ns, end_ns, _, (first, _) = self.pieces.pop()
+                    size += length
+                else:
+                    size = length
+                self.pieces.append(Piece(min(start_ns, log_time), max(end_ns, log_time), self, (first, row)))
+            (rows,) = self._database.execute("SELECT count(*) FROM messages").fetchone()
+            if rows > self.counts.total():
+                self.note(f"{rows - self.counts.total()} row(s) hold no message of a known topic")
+        except _ERRORS as error:
+            self.note(f"is not readable to its end: {_one_line(error)}")
 
 
 def _text(cell: Any) -> str:

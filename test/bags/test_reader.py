@@ -18,6 +18,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 import foreign_bags as foreign
 from bags_helpers import FLOAT64, float64, topic
 from disk_helpers import private_folder
+from iwm_power_manager.bags import limits
 from iwm_power_manager.bags.metadata import parse_qos
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.bags.recover import recover
@@ -110,16 +111,19 @@ def test_overlapping_chunks_and_files_are_merged_by_log_time(tmp_path: Path) -> 
     assert [entry[0] for entry in contents(tmp_path / "bag")] == list(range(2000))
 
 
-@pytest.mark.parametrize("storage", ["chunks", "one chunk", "no chunks", "two files", "cut off", "sqlite3"])
+@pytest.mark.parametrize(
+    "storage", ["chunks", "one chunk", "no chunks", "two files", "split there", "cut off", "sqlite3"]
+)
 def test_a_bag_whose_clock_was_set_back_is_read_in_the_order_of_recording(tmp_path: Path, storage: str) -> None:
     drive = foreign.drive()
     shifted = [(log_ns - 3600 * 10**9 * (i >= 150), number, data) for i, (log_ns, number, data) in enumerate(drive)]
     path = tmp_path / "bag"
     if storage == "sqlite3":
         foreign.write_sqlite(path, shifted)
-    elif storage == "two files":
-        foreign.write_mcap(path / "a_0.mcap", shifted[:200])
-        foreign.write_mcap(path / "a_1.mcap", shifted[200:])
+    elif storage in ("two files", "split there"):
+        first = 150 if storage == "split there" else 200
+        foreign.write_mcap(path / "a_0.mcap", shifted[:first])
+        foreign.write_mcap(path / "a_1.mcap", shifted[first:])
         foreign.write_metadata(path, relative_file_paths=["a_0.mcap", "a_1.mcap"])
     elif storage == "no chunks":
         records = foreign.announced() + foreign.message_records(shifted)
@@ -134,6 +138,30 @@ def test_a_bag_whose_clock_was_set_back_is_read_in_the_order_of_recording(tmp_pa
         assert [(m.log_time_ns, m.data) for m in reader.messages()] == [(log_ns, data) for log_ns, _, data in shifted]
         (note,) = reader.notes
         assert note.endswith("the clock was set back meanwhile: it is read in the order of recording")
+
+
+def test_files_of_two_recorders_are_merged_by_their_log_times(tmp_path: Path) -> None:
+    later, earlier = foreign.drive()[150:], foreign.drive()[:150]
+    foreign.write_mcap(tmp_path / "bag" / "a_0.mcap", later)
+    foreign.write_mcap(tmp_path / "bag" / "b_0.mcap", earlier)
+    with BagReader(tmp_path / "bag") as reader:
+        assert [(m.log_time_ns, m.data) for m in reader.messages()] == [(t, data) for t, _, data in earlier + later]
+
+
+def test_a_lone_chunk_is_unpacked_once_however_long_its_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = foreign.write_mcap(tmp_path / "a.mcap", foreign.drive(), chunk_bytes=10**9)
+    unpacked: list[int] = []
+    decompress = limits.decompress
+
+    def counted(compression: str, data: bytes, size: int | None = None) -> bytes:
+        unpacked.append(len(data))
+        return decompress(compression, data, size)
+
+    monkeypatch.setattr(limits, "decompress", counted)
+    with BagReader(path) as reader:
+        assert reader.end_ns - reader.start_ns > limits.SET_BACK_NS
+        assert len(list(reader.messages())) == len(foreign.drive())
+    assert len(unpacked) == 1
 
 
 def test_topics_written_one_after_the_other_are_read_by_their_log_times(tmp_path: Path) -> None:

@@ -34,7 +34,6 @@ ROS_MODULES = {
 ROSDEP_KEYS = {
     "bokeh": "python3-bokeh-pip",
     "jinja2": "python3-jinja2",
-    "apsw": "python3-rosbags-pip",
     "llvmlite": "python3-numba",
     "lz4": "python3-rosbags-pip",
     "matplotlib": "python3-matplotlib",
