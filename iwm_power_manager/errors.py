@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from iwm_power_manager.exit_codes import BAD_INPUT, FAILED
@@ -87,3 +88,12 @@ class PolicyError(IwmError):
 
 class BagError(IwmError):
     """A bag cannot be read or written."""
+
+
+@contextmanager
+def system_errors(path: Path | str, what: str, kind: type[BagError] = BagError) -> Iterator[None]:
+    """What the system refuses meanwhile as the one line "path: what: reason"."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{path}: {what}: {error.strerror or error}") from None

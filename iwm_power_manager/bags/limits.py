@@ -11,11 +11,13 @@ import io
 import shutil
 import stat
 from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-from iwm_power_manager.errors import BagError
+import lz4.frame
+import zstandard
+
+from iwm_power_manager.errors import BagError, system_errors
 from iwm_power_manager.share import did_you_mean
 
 _MEBIBYTE = 1024 * 1024
@@ -25,8 +27,6 @@ MAX_CHUNK_BYTES = 256 * _MEBIBYTE
 #: What is decompressed, by what it was decompressed from; small things may be more.
 MAX_RATIO = 1000
 FREE_BYTES = 16 * _MEBIBYTE
-#: Frames of lz4 in one chunk: what is behind each is copied.
-MAX_LZ4_FRAMES = 64
 #: Messages in one chunk, and the memory of those that wait for chunks that overlap theirs in time.
 MAX_CHUNK_MESSAGES = 1_000_000
 MAX_OVERLAP_BYTES = 512 * _MEBIBYTE
@@ -46,9 +46,10 @@ MAX_QOS_BYTES = 64 * 1024
 SQLITE_INSTRUCTIONS = 100_000_000
 SQLITE_INSTRUCTIONS_PER_BYTE = 100
 
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-#: How a compressed message begins: CDR begins otherwise, so no metadata is needed.
-PACKED = {ZSTD_MAGIC: "zstd", b"\x04\x22\x4d\x18": "lz4"}
+#: How a compressed file or message begins: CDR begins otherwise, so no metadata is needed.
+PACKED = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}
+_ZSTD = zstandard.ZstdDecompressor(max_window_size=1 << 27)
+_DAMAGED = (zstandard.ZstdError, RuntimeError, EOFError, MemoryError)
 
 
 def check_exists(path: Path) -> None:
@@ -97,7 +98,15 @@ def decompress(compression: str, data: bytes, size: int | None = None) -> bytes:
     most = min(MAX_CHUNK_BYTES, FREE_BYTES + MAX_RATIO * len(data))
     if size is not None and size > most:
         raise BagError(f"{len(data)} bytes say they hold {size}; allowed: <= {most}")
-    raw = _decompressed(compression, data, most + 1 if size is None else size + 1, size)
+    if not compression:
+        return data
+    try:
+        with _unpacking(compression, io.BytesIO(data)) as reader:
+            raw = bytes(reader.read(most + 1 if size is None else size))
+            with suppress(*_DAMAGED):  # what stands behind a whole frame and is none itself
+                raw += reader.read(1)
+    except _DAMAGED:
+        raise BagError("cannot be decompressed") from None
     if len(raw) > most:
         raise BagError(f"{len(data)} bytes hold more than {most}")
     if (len(raw) != size) if size is not None else not raw:
@@ -105,69 +114,34 @@ def decompress(compression: str, data: bytes, size: int | None = None) -> bytes:
     return raw
 
 
-def _decompressed(compression: str, data: bytes, most: int, size: int | None) -> bytes:
-    import lz4.frame
-    import zstandard
-
-    try:
-        if compression == "":
-            return data[:most]
-        if compression == "lz4":
-            raw, rest = b"", data
-            for _ in range(MAX_LZ4_FRAMES):
-                decoder = lz4.frame.LZ4FrameDecompressor()
-                raw += decoder.decompress(rest, max_length=most - len(raw))
-                rest = decoder.unused_data or b""
-                if not rest or len(raw) == most:
-                    break
-            return raw
-        if compression == "zstd":
-            stated = zstandard.frame_content_size(data)
-            if 0 <= stated < most:
-                with suppress(zstandard.ZstdError):  # allocates what the frame says, which is allowed
-                    return bytes(_zstd().decompress(data, allow_extra_data=stated == size))
-            with _zstd().stream_reader(io.BytesIO(data), read_across_frames=True) as reader:
-                return bytes(reader.read(most))
-    except (RuntimeError, EOFError, MemoryError, zstandard.ZstdError):
-        raise BagError("cannot be decompressed") from None
-    raise BagError(f"is compressed with {compression!r}; known: zstd, lz4")
-
-
-@lru_cache(maxsize=1)
-def _zstd() -> Any:
-    import zstandard
-
-    return zstandard.ZstdDecompressor(max_window_size=1 << 27)
+def _unpacking(compression: str, source: IO[bytes]) -> Any:
+    if compression not in PACKED.values():
+        raise BagError(f"is compressed with {compression!r}; known: zstd, lz4")
+    return _ZSTD.stream_reader(source, read_across_frames=True) if compression == "zstd" else lz4.frame.open(source)
 
 
 def decompress_file(path: Path, target: Path) -> str:
-    """Decompress a `.zstd` file to the disk as far as it goes; returns what is wrong with it, "" for nothing.
+    """Decompress a `.zstd` or `.lz4` file to the disk as far as it goes; returns what is wrong with it, "" for nothing.
 
     Raises
     ------
     BagError
         It holds more than its size, or the disk, allows, or nothing.
     """
-    import zstandard
-
     size = regular_file(path)
     most = min(FREE_BYTES + MAX_RATIO * size, shutil.disk_usage(target.parent).free // 2)
     written, problem = 0, ""
-    try:
-        with (
-            path.open("rb") as source,
-            target.open("xb") as sink,
-            _zstd().stream_reader(source, read_across_frames=True) as reader,
-        ):
+    with system_errors(path, "cannot be decompressed"), path.open("rb") as source, target.open("xb") as sink:
+        reader = _unpacking(PACKED.get(source.read(4), "zstd"), source)
+        source.seek(0)
+        try:
             while piece := reader.read1(1 << 20):  # `read` would lose what stands before a damaged place
                 written += len(piece)
                 if written > most:
                     raise BagError(f"{path}: holds more than {most} bytes, from {size}")
                 sink.write(piece)
-    except zstandard.ZstdError as error:
-        problem = f"is damaged: {error}"
-    except OSError as error:
-        raise BagError(f"{path}: cannot be decompressed: {error.strerror or error}") from None
+        except _DAMAGED as error:
+            problem = f"is damaged: {error}"
     if not written:
         raise BagError(f"{path}: {problem or 'holds nothing that can be decompressed'}")
     return problem

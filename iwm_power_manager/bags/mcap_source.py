@@ -33,7 +33,7 @@ from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema, S
 
 from iwm_power_manager.bags import limits
 from iwm_power_manager.bags.metadata import CUSTOM_METADATA, Topic, information_of, parse_qos, text_values
-from iwm_power_manager.errors import BagError
+from iwm_power_manager.errors import BagError, system_errors
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -295,11 +295,8 @@ class McapSource(Source):
         self._too_much_at = _NEVER  # byte from which on chunks are not unpacked
         if limits.regular_file(path) == 0:
             raise BagError(f"{path}: is empty")
-        try:
-            with path.open("rb") as stream:
-                self.data: Any = stack.enter_context(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
-        except OSError as error:
-            raise BagError(f"{path}: cannot be read: {error.strerror or error}") from None
+        with system_errors(path, "cannot be read"), path.open("rb") as stream:
+            self.data: Any = stack.enter_context(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
         begins = self.data[: len(MAGIC)] == MAGIC
         statistics = self._survey()
         if not (begins or self.pieces):

@@ -23,7 +23,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
 from iwm_power_manager.bags import limits
-from iwm_power_manager.bags.limits import PACKED, ZSTD_MAGIC, check_exists, decompress, decompress_file, regular_file
+from iwm_power_manager.bags.limits import PACKED, check_exists, decompress, decompress_file, regular_file
 from iwm_power_manager.bags.mcap_source import MAGIC, ChannelMessage, McapSource, Piece, Source
 from iwm_power_manager.bags.metadata import (
     METADATA_FILE,
@@ -35,10 +35,10 @@ from iwm_power_manager.bags.metadata import (
     typed,
 )
 from iwm_power_manager.bags.sqlite_source import SqliteSource
-from iwm_power_manager.errors import BagError
+from iwm_power_manager.errors import BagError, system_errors
 
 SUFFIXES = (".mcap", ".db3")
-COMPRESSED_SUFFIX = ".zstd"
+COMPRESSED_SUFFIXES = (".zstd", ".lz4")
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _NEVER = 2**64
 _DIGITS = re.compile(r"\d+")
@@ -69,7 +69,7 @@ class BagReader:
 
     Parameters
     ----------
-    path : folder of the bag, or one `.mcap` or `.db3` file, which may be compressed (`.mcap.zstd`)
+    path : folder of the bag, or one `.mcap` or `.db3` file, which may be compressed (`.mcap.zstd`, `.mcap.lz4`)
 
     Attributes
     ----------
@@ -260,16 +260,20 @@ def _unpacked(piece: Piece) -> list[ChannelMessage]:
 
 def recovered(path: Path) -> Path:
     """Where a recovered file goes."""
-    return path.with_name(path.name.removesuffix(COMPRESSED_SUFFIX)).with_suffix(".mcap")
+    return path.with_name(plain_name(path)).with_suffix(".mcap")
+
+
+def plain_name(path: Path) -> str:
+    """A file's name without what says that it is compressed."""
+    return path.stem if path.suffix in COMPRESSED_SUFFIXES else path.name
 
 
 def begins_as_data(path: Path, folder: Path | None = None) -> bool:
     """Whether a file begins as one that can be read, whatever its name: not if it is what a power cut has left."""
     with suppress(BagError):
         regular_file(path, folder)
-        return path.suffix == COMPRESSED_SUFFIX or _head(path, len(MAGIC)).startswith(
-            (MAGIC, _SQLITE_MAGIC[: len(MAGIC)], ZSTD_MAGIC)
-        )
+        begins = (MAGIC, _SQLITE_MAGIC[: len(MAGIC)], *PACKED)
+        return path.suffix in COMPRESSED_SUFFIXES or _head(path, len(MAGIC)).startswith(begins)
     return False
 
 
@@ -294,10 +298,10 @@ def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside
         It is no regular file, lies outside of its `folder`, or cannot be decompressed.
     """
     regular_file(path, folder)
-    named = path.suffix == COMPRESSED_SUFFIX
+    named = path.suffix in COMPRESSED_SUFFIXES
     if journals(path):
         return path, "has a journal, which is not read: recorder --recover does that"
-    if not named and _head(path, len(ZSTD_MAGIC)) != ZSTD_MAGIC:
+    if not named and _head(path, 4) not in PACKED:
         return path, ""
     where = path.parent if beside else None
     copied = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="iwm_bag_", dir=where))) / path.stem
@@ -312,11 +316,8 @@ def journals(path: Path) -> list[Path]:
 
 def _head(path: Path, size: int) -> bytes:
     """The first bytes of a file; `BagError` if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return file.read(size)
-    except OSError as error:
-        raise BagError(f"{path}: cannot be read: {error.strerror or error}") from None
+    with system_errors(path, "cannot be read"), path.open("rb") as file:
+        return file.read(size)
 
 
 def open_source(opened: Path, path: Path, stack: ExitStack) -> Source:
@@ -333,11 +334,9 @@ def open_source(opened: Path, path: Path, stack: ExitStack) -> Source:
 
 def data_files(folder: Path) -> list[Path]:
     """Data files of a bag's folder in the order of recording: `bag_10.mcap` comes after `bag_9.mcap`."""
-    try:
+    with system_errors(folder, "cannot be read"):
         entries = list(folder.iterdir())
-    except OSError as error:
-        raise BagError(f"{folder}: cannot be read: {error.strerror or error}") from None
-    names = [entry for entry in entries if entry.name.removesuffix(COMPRESSED_SUFFIX).endswith(SUFFIXES)]
+    names = [entry for entry in entries if plain_name(entry).endswith(SUFFIXES)]
     real = {os.path.realpath(name) for name in names if not name.is_symlink()}
     names = [name for name in names if not (name.is_symlink() and os.path.realpath(name) in real)]  # the same twice
     return sorted(names, key=_recording_order)

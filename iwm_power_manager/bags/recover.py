@@ -39,7 +39,7 @@ from iwm_power_manager.bags.metadata import (
 )
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
-from iwm_power_manager.errors import BagError
+from iwm_power_manager.errors import BagError, system_errors
 from iwm_power_manager.files import sync_folder
 
 _DAMAGED = ".damaged"
@@ -170,7 +170,7 @@ def _names(path: Path) -> list[Path]:
     """Data files; not those of which an earlier recovery has left its result beside them."""
     check_exists(path)
     if not os.path.isdir(path):
-        named = path.name.removesuffix(reader.COMPRESSED_SUFFIX).endswith(reader.SUFFIXES)
+        named = reader.plain_name(path).endswith(reader.SUFFIXES)
         if not (named or reader.begins_as_data(path)):
             raise BagError(f"{path}: is no folder and no .mcap or .db3 file")
         return [path]
@@ -227,7 +227,7 @@ class _File:
     def __init__(self, path: Path, stack: ExitStack, gaps: _Gaps) -> None:
         self._stack = stack
         self.path = path
-        self.is_compressed = path.suffix == reader.COMPRESSED_SUFFIX
+        self.is_compressed = path.suffix in reader.COMPRESSED_SUFFIXES
         self._temporary: Path | None = None
         opened, problem = _opened(path, stack)
         self.seen = _Seen(reader.open_source(opened, path, stack), gaps)
@@ -246,13 +246,11 @@ class _File:
         if target != self.path and os.path.lexists(target):
             raise BagError(f"{target}: exists, and what is recovered of {self.path.name} would go there: move it away")
         temporary = target.with_name(target.name + ".recovering")
-        try:
+        with system_errors(temporary, "cannot be written"):
             temporary.unlink(missing_ok=True)
             self._stack.callback(temporary.unlink, missing_ok=True)
             copy = _Copy(self.seen.source, temporary)
             made = _Seen(reader.open_source(temporary, target, self._stack), _Gaps())
-        except OSError as error:
-            raise BagError(f"{temporary}: cannot be written: {error.strerror or error}") from None
         if made.source.damage or made.count < self.seen.count:
             raise BagError(
                 f"{temporary}: holds {made.count} of {self.seen.count} messages; the original is left as it is"
@@ -266,7 +264,7 @@ class _File:
         """Let the rebuilt file take its place."""
         if self._temporary is None:
             return
-        try:
+        with system_errors(self._temporary, "cannot be written"):
             if _DAMAGED in self.report.kept:
                 keep = self.path.with_name(self.report.kept)
                 try:
@@ -275,8 +273,6 @@ class _File:
                     shutil.copy2(self.path, keep)
             os.replace(self._temporary, self.path)
             sync_folder(self.path.parent)
-        except OSError as error:
-            raise BagError(f"{self._temporary}: cannot be written: {error.strerror or error}") from None
 
 
 def _free_name(path: Path) -> str:

@@ -13,7 +13,7 @@ import stat
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice, starmap
@@ -24,7 +24,7 @@ from iwm_power_manager import __version__
 from iwm_power_manager.bags import metadata
 from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
 from iwm_power_manager.bags.mcap_source import RECORD_OVERHEAD_BYTES
-from iwm_power_manager.errors import BagError, ConfigError
+from iwm_power_manager.errors import BagError, ConfigError, system_errors
 from iwm_power_manager.files import atomic_write, sync_folder
 
 #: One message: topic's number, log time (ns, when it was received and what readers sort by), CDR bytes with their
@@ -109,12 +109,10 @@ class BagWriter:
         self._fill = (0, 0)  # how large the file was, and what has been given to it since
         self._file_start_ns: int | None = None  # log time of its first message
         self._file: McapFile | None = None  # none once the bag is closed, or if the next file could not be opened
-        try:
+        if os.path.lexists(self.path):
+            raise BagError(f"{self.path}: exists already and is not overwritten; choose another name")
+        with system_errors(self.path, "cannot be created"):
             _make_folder(self.path)
-        except FileExistsError:
-            raise BagError(f"{self.path}: exists already and is not overwritten; choose another name") from None
-        except OSError as error:
-            raise BagError(f"{self.path}: cannot be created: {error.strerror or error}") from None
         try:
             self._open_file()
         except BagError:
@@ -253,13 +251,9 @@ class BagWriter:
             raise WriteFailed(f"{self.path}: is closed, or its next file could not be created")
         return self._file
 
-    @contextmanager
-    def _failing(self) -> Iterator[None]:
+    def _failing(self) -> AbstractContextManager[None]:
         """What the disk says as what this bag says."""
-        try:
-            yield
-        except OSError as error:
-            raise WriteFailed(f"{self.path}: cannot be written: {error.strerror or os.fspath(self.path)}") from None
+        return system_errors(self.path, "cannot be written", WriteFailed)
 
     def _open_file(self) -> None:
         """Begin the next file; one that cannot take its definitions is removed again."""
@@ -327,10 +321,11 @@ def write_metadata(folder: Path, information: Mapping[str, Any]) -> None:
     """Write a bag's `metadata.yaml`; `WriteFailed` if it cannot be. What it says is of `metadata.bag_information`."""
     path = folder / metadata.METADATA_FILE
     try:
-        if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):  # what a link leads to is not the bag's
-            path.unlink()
-        atomic_write(path, metadata.yaml_text({"rosbag2_bagfile_information": information}).encode())
+        with system_errors(path, "cannot be written", WriteFailed):
+            if os.path.lexists(path) and not stat.S_ISREG(
+                path.lstat().st_mode
+            ):  # what a link leads to is not the bag's
+                path.unlink()
+            atomic_write(path, metadata.yaml_text({"rosbag2_bagfile_information": information}).encode())
     except ConfigError as error:
         raise WriteFailed(str(error)) from None
-    except OSError as error:
-        raise WriteFailed(f"{path}: cannot be written: {error.strerror or error}") from None

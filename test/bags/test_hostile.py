@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import bz2
 import os
 import sqlite3
 import struct
@@ -248,6 +249,24 @@ def test_of_a_compressed_file_what_stands_before_damage_is_read(tmp_path: Path) 
     assert count == 15
     assert "is damaged: zstd decompress error: Unknown frame" in line
     assert recover(path).files[0].message_count == 15
+
+
+def test_a_file_compressed_with_lz4_is_read_and_recovered(tmp_path: Path) -> None:
+    whole = foreign.write_mcap(tmp_path / "a.mcap", foreign.drive(5)).read_bytes()
+    path = tmp_path / "bag" / "a_0.mcap.lz4"
+    path.parent.mkdir()
+    path.write_bytes(lz4.frame.compress(whole))
+    assert contents(path) == contents(path.parent) == (15, [])
+    assert recover(path.parent).files[0].kept == path.name
+    assert contents(path.with_name("a_0.mcap")) == (15, [])
+
+
+def test_a_chunk_compressed_with_anything_else_is_one_line(tmp_path: Path) -> None:
+    records = foreign.message_records(foreign.drive(5))
+    packed = foreign.chunk(records, "bz2", bz2.compress(records))
+    count, (line,) = contents(foreign.write_records(tmp_path / "a.mcap", foreign.announced(), packed))
+    assert count == 0
+    assert line.endswith("is compressed with 'bz2'; known: zstd, lz4")
 
 
 def test_a_compressed_file_whose_name_does_not_say_so_is_read_and_recovered(tmp_path: Path) -> None:
