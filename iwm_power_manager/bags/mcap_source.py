@@ -304,10 +304,7 @@ class McapSource(Source):
         self.information = information_of(self.metadata.get("rosbag2", {}).get("serialized_metadata", ""))
         own = self.metadata.get(CUSTOM_METADATA, {})
         self.custom_data = text_values(self.information.get("custom_data")) | own
-        if statistics is not None and self._all_defined(statistics):
-            self.counts.update(statistics.channel_message_counts)
-        else:
-            self._open_all()
+        self._count(statistics)
         for number, channel in self.definitions.channels.items():
             schema = self.definitions.schemas.get(channel.schema_id) or Schema(id=0, data=b"", encoding="", name="")
             self.topics[number] = Topic(
@@ -375,24 +372,23 @@ class McapSource(Source):
             record = last._replace(end=record.end)
         self.pieces.append(Piece(min(start_ns, log_time), max(end_ns, log_time), self, record))
 
-    def _all_defined(self, statistics: Statistics) -> bool:
-        """Whether what was met outside of chunks defines all topics; the definitions may stand in chunks alone."""
-        definitions = self.definitions
-        known = definitions.channels.keys()
-        schemas = {channel.schema_id for channel in definitions.channels.values()} - {0}
-        return bool(
-            known >= statistics.channel_message_counts.keys() and known and definitions.schemas.keys() >= schemas
-        )
+    def _count(self, statistics: Statistics | None) -> None:
+        """Take the summary's word, if all it counts is defined outside of chunks; else look into every chunk.
 
-    def _open_all(self) -> None:
-        """Look into every chunk: channels may be announced there and nowhere else, and its head may be wrong."""
+        Channels may be announced there and nowhere else, and its head may be wrong.
+        """
+        channels, counts = self.definitions.channels, statistics.channel_message_counts if statistics else {}
+        schemas = {channel.schema_id for channel in channels.values()} - {0}
+        if statistics and channels and channels.keys() >= counts.keys() and self.definitions.schemas.keys() >= schemas:
+            self.counts.update(counts)
+            return
         pieces, self.pieces = self.pieces, []
         for piece in pieces:
             messages = self.unpack(piece)
             self.counts.update(message[1] for message in messages)
             if messages:
                 times = [message[0] for message in messages]
-                self.pieces.append(Piece(min(times), max(times), self, piece.place))
+                self.pieces.append(piece._replace(start_ns=min(times), end_ns=max(times)))
 
     def unpack(self, piece: Piece) -> list[ChannelMessage]:
         """Messages of a chunk; none if it is damaged, or too large."""

@@ -179,12 +179,12 @@ _KINDS = {
 }
 
 
-def topic_counts(files: Iterable[tuple[Mapping[int, Topic], Mapping[int, int]]]) -> Counter[str]:
-    """Messages by the name of their topic, from the topics and the counts of each file, by channel."""
+def topic_counts(files: Iterable[Any]) -> Counter[str]:
+    """Messages by the name of their topic, from the `topics` and the `counts` of each file, by channel."""
     counts: Counter[str] = Counter()
-    for topics, found in files:
-        for number, topic in topics.items():
-            counts[topic.name] += found.get(number, 0)
+    for file in files:
+        for number, topic in file.topics.items():
+            counts[topic.name] += file.counts[number]
     return counts
 
 

@@ -20,7 +20,7 @@ from functools import lru_cache
 from itertools import accumulate, count
 from operator import itemgetter
 from pathlib import Path, PurePosixPath
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 from iwm_power_manager.bags import limits
 from iwm_power_manager.bags.limits import PACKED, check_exists, decompress, decompress_file, regular_file
@@ -64,8 +64,8 @@ class Message(NamedTuple):
     sequence: int
 
 
-class BagReader:
-    """A bag, opened for reading.
+class BagReader(ExitStack):
+    """A bag, opened for reading; its files are closed with it.
 
     Parameters
     ----------
@@ -86,9 +86,9 @@ class BagReader:
     """
 
     def __init__(self, path: Path | str) -> None:
+        super().__init__()
         self.path = Path(path)
         check_exists(self.path)
-        self._stack = ExitStack()
         self._damage: list[str] = []
         self.notes: list[str] = []
         self.sources: list[Source] = []
@@ -115,21 +115,11 @@ class BagReader:
                 f"{self._set_back.path}: the clock was set back meanwhile: it is read in the order of recording"
             )
         if self.information and not self.damage:
-            held = topic_counts((source.topics, source.counts) for source in self.sources)
+            held = topic_counts(self.sources)
             if miscounted(self.information, held):
                 self.notes.append(f"{self.path}: metadata.yaml miscounts the messages: {held.total()} are there")
         self.start_ns = min((piece.start_ns for piece in self._pieces if piece.end_ns), default=0)
         self.end_ns = max((piece.end_ns for piece in self._pieces), default=0)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Release the files."""
-        self._stack.close()
 
     @property
     def damage(self) -> list[str]:
@@ -227,10 +217,10 @@ class BagReader:
         problems = []
         for name in self._file_names():
             try:
-                opened, problem = opened_file(name, self._stack, self.path if self.path != name else None)
+                opened, problem = opened_file(name, self, self.path if self.path != name else None)
                 harmless = problem == MISNAMED
                 (self.notes if harmless else self._damage).extend([f"{name}: {problem}"] if problem else [])
-                self.sources.append(open_source(opened, name, self._stack))
+                self.sources.append(open_source(opened, name, self))
             except BagError as error:
                 problems.append(str(error))
         if not self.sources:

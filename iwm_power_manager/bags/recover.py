@@ -136,17 +136,18 @@ def recover(path: Path | str) -> Recovery:
         for name in names:
             try:
                 regular_file(name, folder)
-                _check_name(name)
+                name.name.encode()
                 files.append(_File(name, stack, gaps))
+            except UnicodeEncodeError:
+                why = f"{name}: its name is no UTF-8 text, which metadata.yaml could not hold: rename it"
+                left_out.append(FileRecovery(name.name, False, 0, why))
             except BagError as error:
                 left_out.append(FileRecovery(name.name, False, 0, str(error)))
         if not files:
             raise BagError(f"{left_out[0].damage}; nothing to recover")
         information, problem = read_metadata(path) if folder else ({}, "none")
         fits = not (problem or left_out) and reader.listed_files(information).keys() == {name.name for name in names}
-        fits = fits and not miscounted(
-            information, topic_counts((file.seen.topics, file.seen.counts) for file in files)
-        )
+        fits = fits and not miscounted(information, topic_counts(file.seen for file in files))
         sqlite = all(file.is_sqlite and not file.problem for file in files)
         for file in files:
             if file.problem or (file.is_sqlite and not sqlite) or (file.is_compressed and not fits):
@@ -183,13 +184,6 @@ def _names(path: Path) -> list[Path]:
     return names
 
 
-def _check_name(path: Path) -> None:
-    try:
-        path.name.encode()
-    except UnicodeEncodeError:
-        raise BagError(f"{path}: its name is no UTF-8 text, which metadata.yaml could not hold: rename it") from None
-
-
 class _Gaps:
     """By topic, the publisher's numbers left out in files and between them, as the messages are taken."""
 
@@ -210,15 +204,16 @@ class _Seen:
         self.topics = source.topics
         self.counts: Counter[int] = Counter()
         self.compression = ""
-        self.start_ns, self.end_ns = 2**64, 0
+        start_ns, self.end_ns = 2**64, 0
         own = _is_own(source)  # other recorders count something else
         for log_time, channel, data, _, sequence in source.messages():
             self.counts[channel] += 1
-            self.start_ns, self.end_ns = min(self.start_ns, log_time), max(self.end_ns, log_time)
+            start_ns, self.end_ns = min(start_ns, log_time), max(self.end_ns, log_time)
             self.compression = self.compression or PACKED.get(data[:4], "")
             if sequence and own and channel in self.topics:
                 gaps.take(self.topics[channel].name, sequence)
         self.count = self.counts.total()
+        self.start_ns = start_ns if self.count else 0
 
 
 class _File:
@@ -378,7 +373,7 @@ class _Copy:
 def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Mapping[str, object]) -> None:
     """`metadata.yaml` of the whole bag, with what the old one or the files know of it."""
     topics: dict[str, Topic] = {}
-    counts = topic_counts((file.seen.topics, file.seen.counts) for file in files)
+    counts = topic_counts(file.seen for file in files)
     custom_data: dict[str, str] = {}
     distro = str(recorded.get("ros_distro") or "")
     for file in files:
@@ -391,11 +386,7 @@ def _write_metadata(folder: Path, files: list[_File], storage: str, recorded: Ma
             topics.setdefault(topic.name, typed(topic, recorded))
     information = bag_information(
         storage,
-        [
-            FileSpan(file.path.name, seen.start_ns if seen.count else 0, seen.end_ns, seen.count)
-            for file in files
-            for seen in [file.seen]
-        ],
+        [FileSpan(file.path.name, file.seen.start_ns, file.seen.end_ns, file.seen.count) for file in files],
         [(topic, counts[name]) for name, topic in topics.items()],
         custom_data | text_values(recorded.get("custom_data")),
         distro=distro,

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import islice, starmap
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from iwm_power_manager import __version__
 from iwm_power_manager.bags import metadata
@@ -70,7 +70,7 @@ class WriteFailed(BagError):
     """The disk is full, the folder is gone or the like: close the bag, which keeps what was written."""
 
 
-class BagWriter:
+class BagWriter(AbstractContextManager["BagWriter"]):
     """A new rosbag2 bag.
 
     Parameters
@@ -119,9 +119,6 @@ class BagWriter:
             with suppress(OSError):
                 self.path.rmdir()  # it would be in the way of the next attempt
             raise
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

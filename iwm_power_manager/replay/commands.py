@@ -140,11 +140,9 @@ def commands_elsewhere(bag: BagReader, mapping: SignalMapping, reports: Collecti
     commands = command_topics(bag, mapping)
     held = {sink.topic for _, sink in commands.values()}
     known = {*commands, *reports, *(topic_named(name, bag.topics) for name in mapping.topics())}
-    found = {}
-    for kind, sinks in mapping.commands.items():
-        types = {sink.type for sink in sinks}
-        if any(sink.topic not in held for sink in sinks):
-            found[kind] = sorted(
-                name for name, topic in bag.topics.items() if topic.type in types and name not in known
-            )
-    return found
+    unknown = {name: topic.type for name, topic in sorted(bag.topics.items()) if name not in known}
+    return {
+        kind: [name for name, type_ in unknown.items() if any(type_ == sink.type for sink in sinks)]
+        for kind, sinks in mapping.commands.items()
+        if any(sink.topic not in held for sink in sinks)
+    }

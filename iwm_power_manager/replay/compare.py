@@ -7,8 +7,9 @@ import math
 from collections import OrderedDict
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
+#: A message of one side: its log time (ns), names and values.
+_Side = tuple[int, Sequence[str], Sequence[float]]
 #: Stamps one side may be ahead of the other before they count as having no counterpart.
 _WINDOW = 10_000
 
@@ -130,11 +131,11 @@ class TopicComparer:
 
     def recorded(self, stamp_ns: int, log_time_ns: int, names: Sequence[str], values: Sequence[float]) -> None:
         """Add a recorded message."""
-        self._add(0, stamp_ns, _Side(log_time_ns, names, values))
+        self._add(0, stamp_ns, (log_time_ns, names, values))
 
     def recomputed(self, stamp_ns: int, log_time_ns: int, names: Sequence[str], values: Sequence[float]) -> None:
         """Add a recomputed message."""
-        self._add(1, stamp_ns, _Side(log_time_ns, names, values))
+        self._add(1, stamp_ns, (log_time_ns, names, values))
 
     def result(self) -> TopicComparison:
         """What has been found so far."""
@@ -159,12 +160,14 @@ class TopicComparer:
     def _compare(self, stamp_ns: int, recorded: _Side, recomputed: _Side) -> None:
         result = self._found
         result.compared += 1
-        self._count += len(recomputed.values)
-        if recorded.names == recomputed.names and recorded.values == recomputed.values:
+        log_time_ns, *was_there = recorded
+        _, names, values = recomputed
+        self._count += len(values)
+        if was_there == [names, values]:
             return  # NaN is not equal to itself, and goes the long way
-        found = dict(zip(recorded.names, recorded.values, strict=False))
+        found = dict(zip(*was_there, strict=False))
         beyond: Difference | None = None
-        for name, value in zip(recomputed.names, recomputed.values, strict=True):
+        for name, value in zip(names, values, strict=True):
             if name not in found and name in self._younger:
                 continue
             was = found.get(name, math.nan)
@@ -173,15 +176,9 @@ class TopicComparer:
             if difference > result.largest:
                 result.largest, result.worst = difference, name
             if difference > self._tolerance and beyond is None:
-                beyond = Difference(result.compared - 1, stamp_ns, recorded.log_time_ns, name, was, value)
+                beyond = Difference(result.compared - 1, stamp_ns, log_time_ns, name, was, value)
         result.differing += beyond is not None
         result.first = result.first or beyond
-
-
-class _Side(NamedTuple):
-    log_time_ns: int
-    names: Sequence[str]
-    values: Sequence[float]
 
 
 def _distance(a: float, b: float) -> float:
