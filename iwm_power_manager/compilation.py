@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 
 import numba
 from llvmlite.binding import Linkage, parse_assembly
-from numba.core import config
+from numba.core import config, typed_passes, untyped_passes
 from numba.core.caching import NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
+from numba.core.compiler_machinery import PassManager
 from numba.core.registry import CPUDispatcher
 from numba.core.runtime import nrtdynmod, rtsys
 from numba.core.serialize import dumps
@@ -116,6 +117,24 @@ def _options(kernel: Kernel) -> dict[str, Any]:
     }
 
 
+#: Numba's passes without those for closures, `with`, literals, inlined functions and expressions of whole arrays.
+_SCALAR_PASSES = (
+    untyped_passes.TranslateByteCode,
+    untyped_passes.FixupArgs,
+    untyped_passes.IRProcessing,
+    untyped_passes.RewriteSemanticConstants,
+    untyped_passes.DeadBranchPrune,
+    untyped_passes.GenericRewrites,
+    untyped_passes.ReconstructSSA,
+    typed_passes.NopythonTypeInference,
+    typed_passes.PreLowerStripPhis,
+    typed_passes.IRLegalization,
+    typed_passes.AnnotateTypes,
+    typed_passes.NativeLowering,
+    typed_passes.NoPythonBackend,
+)
+
+
 class _Code(JITCodeLibrary):
     """Code that is only linked into other code: optimised there, once, and no machine code of its own."""
 
@@ -127,7 +146,21 @@ class _Code(JITCodeLibrary):
         self._finalized = True
 
 
-class _PartCompiler(Compiler):
+class _ScalarCompiler(Compiler):
+    """Numba's compiler, with fewer passes for kernels that have neither arrays of their own nor functions inside."""
+
+    def define_pipelines(self) -> list[PassManager]:
+        """Numba's passes, or `_SCALAR_PASSES`: they make the same code of such a kernel."""
+        if self.state.flags.nrt or any(hasattr(value, "co_code") for value in self.state.func_id.code.co_consts):
+            return super().define_pipelines()
+        manager = PassManager("kernel")
+        for step in _SCALAR_PASSES:
+            manager.add_pass(step, step.__name__)
+        manager.finalize()
+        return [manager]
+
+
+class _PartCompiler(_ScalarCompiler):
     """Numba's compiler, up to the code that is linked into the caller."""
 
     def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, names: Any) -> None:
@@ -146,6 +179,12 @@ class _Part(CPUDispatcher):
         """As numba's, but True and False, 1 and 2 are one type each: no copy of the kernel for every literal."""
         _, arguments = self._compiler.fold_argument_types(arguments, names)
         return super().get_call_template(tuple(unliteral(kind) for kind in arguments), {})
+
+    def compile(self, signature: Any) -> Any:
+        """Compile it for a signature; whoever calls it holds numba's lock."""
+        if (found := self.overloads.get(signature)) is None:
+            self.add_overload(self._compiler.compile(signature, None))
+        return found
 
     def add_overload(self, result: CompileResult) -> None:
         """Let callers find what was compiled; there is nothing that Python could call."""
@@ -200,7 +239,7 @@ class _WholeCode(JITCodeLibrary):
         return parse_assembly("\n".join([str(self._codegen._create_empty_module(self.name)), *known]))
 
 
-class _EntryCompiler(Compiler):
+class _EntryCompiler(_ScalarCompiler):
     """Numba's compiler, for code that is called from Python only."""
 
     def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, names: Any) -> None:

@@ -60,6 +60,18 @@ def test_importing_kernels_imports_no_compiler() -> None:
 
 
 @kernel
+def with_a_function_inside(a: float) -> float:
+    def doubled(b: float) -> float:
+        return 2.0 * b
+
+    return doubled(a)
+
+
+def test_a_kernel_may_hold_a_function() -> None:
+    assert with_a_function_inside(3.0) == 6.0
+
+
+@kernel
 def handed_back(axes):
     return axes
 
