@@ -20,10 +20,10 @@ from numba.core.caching import NullCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
 from numba.core.compiler_machinery import PassManager
-from numba.core.registry import CPUDispatcher
+from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.runtime import nrtdynmod, rtsys
 from numba.core.serialize import dumps
-from numba.core.types import Array
+from numba.core.types import Array, Function
 from numba.core.types.containers import BaseNamedTuple, BaseTuple
 from numba.core.types.misc import unliteral
 
@@ -146,6 +146,29 @@ class _Code(JITCodeLibrary):
         self._finalized = True
 
 
+class _Typing:
+    """Numba's typing context, which looks for the types of `a + b` in all its tables once, not at each `+`."""
+
+    def __init__(self, context: Any) -> None:
+        self._context = context
+        self._found: dict[Any, Any] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._context, name)
+
+    def resolve_function_type(self, function: Any, arguments: Any, names: Any) -> Any:
+        """As numba's; built-in operators are remembered."""
+        if not isinstance(function, Function) or names:
+            return self._context.resolve_function_type(function, arguments, names)
+        key = (function, arguments)
+        if key not in self._found:
+            self._found[key] = self._context.resolve_function_type(function, arguments, names)
+        return self._found[key]
+
+
+_TYPING = _Typing(cpu_target.typing_context)
+
+
 class _ScalarCompiler(Compiler):
     """Numba's compiler, with fewer passes for kernels that have neither arrays of their own nor functions inside."""
 
@@ -165,7 +188,7 @@ class _PartCompiler(_ScalarCompiler):
 
     def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, names: Any) -> None:
         flags.no_compile = True
-        super().__init__(typing, target, library or _Code(target.codegen(), "part"), args, result, flags, names)
+        super().__init__(_TYPING, target, library or _Code(target.codegen(), "part"), args, result, flags, names)
 
 
 def _holds_arrays(kind: Any) -> bool:
@@ -245,7 +268,7 @@ class _EntryCompiler(_ScalarCompiler):
     def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, names: Any) -> None:
         library = _WholeCode(target.codegen(), "entry")
         library.enable_object_caching()
-        super().__init__(typing, target, library, args, result, flags, names)
+        super().__init__(_TYPING, target, library, args, result, flags, names)
 
 
 class _Entry(CPUDispatcher):
