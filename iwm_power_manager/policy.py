@@ -49,7 +49,7 @@ from iwm_power_manager.mdp.demand import DemandChain, Source
 from iwm_power_manager.mdp.policy_iteration import Iteration, Solution
 from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
 from iwm_power_manager.mdp.problem import Problem, problem_from
-from iwm_power_manager.mdp.sweep import GATED, expect_over_demand
+from iwm_power_manager.mdp.sweep import GATED
 from iwm_power_manager.model.decision import (
     axles_gated,
 )
@@ -141,11 +141,12 @@ class Policy:
         problem = self.problem
 
         def expected(cost_j: NDArray[np.float64]) -> NDArray[np.float64]:
-            rows = problem.power_w.size
-            cost = np.ascontiguousarray(cost_j).reshape(rows, -1)
-            ahead = np.empty_like(cost)
-            columns = cost.shape[1]
-            expect_over_demand(self.chain.matrix, cost, columns, columns // problem.speed_mps.size, 0, columns, ahead)
+            """As `expect_over_demand`, to the last bit, but with nothing to compile before the first command."""
+            cost = np.ascontiguousarray(cost_j).reshape(problem.power_w.size, problem.speed_mps.size, -1)
+            ahead = np.zeros_like(cost)
+            for q, weight in enumerate(self.chain.matrix.transpose(2, 1, 0)[..., np.newaxis]):
+                reached = weight.any(axis=(1, 2))
+                ahead[reached] += weight[reached] * cost[q]
             return ahead.reshape(problem.shape)
 
         dearer = np.zeros((len(self.dearer_cost_j), *problem.shape))

@@ -21,6 +21,7 @@ from iwm_power_manager.errors import PolicyError
 from iwm_power_manager.mdp.demand import Source, demand_chain
 from iwm_power_manager.mdp.policy_iteration import solve
 from iwm_power_manager.mdp.problem import load_problem
+from iwm_power_manager.mdp.sweep import expect_over_demand
 from iwm_power_manager.mdp.transitions import build_model
 from iwm_power_manager.policy import (
     choose,
@@ -124,6 +125,16 @@ def test_the_expected_cost_is_the_mean_over_the_next_demand(solved):
     policy, _ = solved
     expected = np.tensordot(policy.chain.probability, policy.cost_j, axes=1)
     assert policy.table().expected_cost_j == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_expected_cost_has_the_bits_of_the_solver(solved):
+    shipped = load_policy(share_path("policies/jalalmaab_2015_drag_coupled_mu050.npz"))
+    for policy in (solved[0], shipped):  # with one matrix for all speeds, and with one for each
+        cost = policy.cost_j.reshape(policy.cost_j.shape[0], -1)
+        ahead, columns = np.empty_like(cost), cost.shape[1]
+        plane = columns // policy.problem.speed_mps.size
+        expect_over_demand(policy.chain.matrix, cost, columns, plane, 0, columns, ahead)
+        assert policy.table().expected_cost_j.tobytes() == ahead.tobytes()
 
 
 def test_without_a_previous_share_a_gated_axle_has_no_share():
