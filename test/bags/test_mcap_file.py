@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import errno
+import io
 from pathlib import Path
 from typing import IO
 
 import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
 
 from iwm_power_manager.bags.mcap_file import COMPRESSIONS, McapFile
 from iwm_power_manager.bags.recover import recover
@@ -52,6 +54,26 @@ def test_a_finished_file_holds_every_message_with_valid_checksums_and_index(tmp_
         found = [m.log_time for _, _, m in reader.iter_messages(topics=["/t1"], starting_at=1500, ending_before=1510)]
         assert found == [1502, 1505, 1508]
         assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [("extra", {"a": "1", "b": ""})]
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_the_bytes_are_those_of_the_package_alone(tmp_path: Path, compression: str) -> None:
+    file = McapFile(tmp_path / "a.mcap", library="test", compression=compression, chunk_bytes=4096)
+    alone = Writer(plain := io.BytesIO(), chunk_size=4096, compression=CompressionType[compression.upper()])
+    alone.start("ros2", "test")
+    for writer in (file.writer, alone):
+        schema = writer.register_schema("pkg/msg/A", "ros2msg", b"float64 data")
+        for i in range(3):
+            writer.register_channel(f"/t{i}", "cdr", schema)
+        for i in range(500):
+            writer.add_message(
+                1 + i % 3, 10**9 + (i * 7919) % 1000, bytes([i % 256]) * (i % 50), 2**63 + i, 2**32 - 1 - i
+            )
+            if i % 100 == 50:
+                writer.flush()
+    file.finish()
+    alone.finish()
+    assert (tmp_path / "a.mcap").read_bytes() == plain.getvalue()
 
 
 def test_log_times_out_of_order_are_found_by_the_index(tmp_path: Path) -> None:
