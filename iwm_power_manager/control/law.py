@@ -7,7 +7,8 @@ The order, which is also the order of precedence from weak to strong:
    direction of travel (`control.direction`), so that brakes brake and slip is slip backwards too;
 1. slip of each wheel (`control.wheel`), filtered (eq. 10), and the torque the road took from it (eq. 11);
 2. split: the strategy decides the front share, many times a second; the applied share follows at a limited rate;
-3. skid gate: a wheel beyond the critical slip (Table 2 as printed: its axle) gets nothing, the others what they can;
+3. skid gate: a wheel beyond the critical slip (Table 2 as printed: its axle), or one that keeps a slip while the road
+   takes next to nothing from it, gets nothing, the others what they can;
 4. capacity: what motors (peak, heat, power; eq. 19, 40), brakes (regeneration, where there are none), the slip limiter
    and the axle's yaw budget let each wheel give; what does not fit on one goes to the axle's other wheel and to the
    other axle (eq. 12);

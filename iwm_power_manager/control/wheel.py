@@ -8,7 +8,9 @@ from typing import NamedTuple
 from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, Settings
 from iwm_power_manager.control.slip import UNLIMITED_NM, filtered, gained_radps, limiter_torque_nm, road_torque_nm
 from iwm_power_manager.control.types import WheelState
+from iwm_power_manager.control.wheel_doubt import FREE_PART, HELD_MPS, HELD_PART
 from iwm_power_manager.jit import kernel
+from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.gate import axle_gated
 from iwm_power_manager.model.motor import heat_after, regeneration_limit_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
@@ -120,6 +122,12 @@ def wheel_of(
             radius,
             axle.wheel.inertia_kgm2,
         )
+        # What slips by so little is on the smoothest ice or has a wrong sensor. With nothing it comes back, or it has.
+        asked = braking or (settings.gate_driving and demand_w > 0.0)
+        slipped = (speed_mps - radius * wheel_speed_radps) * (1.0 if braking else -1.0)
+        free_nm = FREE_PART * 0.25 * vehicle.chassis.mass_kg * GRAVITY_MPS2 * radius
+        if asked and max(grip, abs(road)) < free_nm and slipped > HELD_PART * speed_mps + HELD_MPS:
+            gated = True
     return Wheel(
         speed_radps=wheel_speed_radps,
         conversion_radps=conversion,

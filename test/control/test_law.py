@@ -879,6 +879,19 @@ def test_the_limiter_holds_the_wheel_at_its_target_slip(demand, friction):
     assert case.command.limits & t.LIMIT_SLIP
 
 
+@pytest.mark.parametrize("demand", [-30e3, 30e3])
+def test_a_wheel_that_keeps_its_slip_with_next_to_no_torque_gets_none(demand):
+    """So it shows whether it slips at all: with a torque that the smoothest ice takes nobody can tell."""
+    slip = math.copysign(0.17, demand)
+    gates, state = [], initial_state()
+    for _ in range(60):
+        case = take(measurement(demand=demand, slips=(slip, slip)), state)
+        state = case.after
+        gates.append(case.command.gate)
+    assert set(gates[-20:]) == {t.GATE_BOTH}
+    assert case.command.motor_torque_nm == (0.0,) * 4
+
+
 # --- Direction: what the whole law makes of a car that moves the wrong way, or both ways ------------------------------
 
 

@@ -201,7 +201,9 @@ def test_what_keeps_one_wheel_from_its_part_is_said_of_that_wheel(wheel):
     wheels = one(wheel, 0.83 * rolling()[wheel], rolling())
     weak = CAR.rear.friction_brake._replace(max_torque_nm=100.0)
     car = CAR._replace(**{name: getattr(CAR, name)._replace(friction_brake=weak) for name in ("front", "rear")})
-    command, after = law.step(measured(-4e3, wheels), remembered(speed_radps=wheels), LIMITER, car, TABLE)
+    taken = (-60.0,) * 4
+    before = remembered(speed_radps=wheels, total_nm=taken, road_nm=taken)
+    command, after = law.step(measured(-12e3, wheels), before, LIMITER, car, TABLE)
     assert abs(after.wheels[wheel].total_nm) < abs(after.wheels[wheel ^ 1].total_nm) - 1.0
     assert command.limits & LIMIT_SLIP
     assert not command.limits & LIMIT_FRICTION_BRAKE

@@ -47,6 +47,16 @@ def grip(braking, road, wheel, speed, target, settings, axle):
     return max(-torque if braking else torque, 0.0)
 
 
+def keeps_slip(braking, wheel, m, settings, vehicle):
+    """Whether a wheel slips although it is given, and takes, less than a twentieth of its share of the weight."""
+    if not (braking or (settings.gate_driving and m.power_demand_w > 0.0)):
+        return False
+    radius = wheel.axle.wheel.radius_m
+    slipped = m.speed_mps - radius * wheel.speed if braking else radius * wheel.speed - m.speed_mps
+    little = 0.05 * vehicle.chassis.mass_kg * 9.81 / 4.0 * radius
+    return wheel.grip < little and abs(wheel.road) < little and slipped > 0.02 * m.speed_mps + 0.1
+
+
 def slip_targets(state, settings, braking):
     """Slip the limiter steers each wheel to: less while left and right are braked unequally."""
     unequal = state.front_unequal_s
@@ -213,6 +223,7 @@ def step(m, state, settings, vehicle, decide):
             wheel.room = brake if braking else torque_limit(wheel.fast, wheel.before.heat, wheel.axle.motor)
             if settings.gate_mode == GATE_MODE_LIMITER:
                 wheel.grip = grip(braking, wheel.road, wheel.speed, m.speed_mps, wheel.target, settings, wheel.axle)
+                wheel.gated |= keeps_slip(braking, wheel, m, settings, vehicle)
             wheel.own = wheel.most = 0.0 if wheel.gated else min(wheel.room, wheel.grip)
         geometry = axle.wheels[0].axle
         mosts = [wheel.most for wheel in axle.wheels]

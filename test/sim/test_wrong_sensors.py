@@ -124,6 +124,29 @@ def test_with_true_sensors_no_wheel_spins_on_the_smoothest_ice(friction, speed_m
     assert found["doubted_s"] == 0.0
 
 
+@pytest.mark.parametrize("wrong_by", [("wheels", 1.2), ("vehicle_speed", 0.83)])
+@pytest.mark.parametrize("friction", [0.5, 0.9])
+def test_a_car_whose_wheels_show_a_fifth_more_than_its_sensor_drives_off(wrong_by, friction):
+    target, factor = wrong_by
+    scenario = dataclasses.replace(
+        braking(0.0, 0.0, friction, (wrong(target, "factor", factor, 0.0),)),
+        demand=(Demand(0.0, "power_w", 15e3),),
+        duration_s=4.0,
+    )
+    assert drive_scenario(scenario).final.speed_mps > 7.0
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "power_w", "broken"),
+    [
+        (17.0, 51.5e3, wrong("wheel_front_left", "value", 38.2, 1.5)),
+        (21.0, 42.3e3, wrong("wheel_rear_right", "offset", -2.85, 0.0)),
+    ],
+)
+def test_a_wheel_that_shows_a_slip_it_does_not_have_takes_its_neighbours_no_brakes(speed_mps, power_w, broken):
+    it_brakes(speed_mps, power_w, 0.9, (broken,))
+
+
 @pytest.mark.parametrize("offset_mps", [-0.5, -0.2, 0.2, 0.3, 0.5])
 @pytest.mark.parametrize("driven_w", [6e3, 12e3])
 def test_a_speed_that_is_a_little_off_from_standstill_on_takes_no_brakes(offset_mps, driven_w):
