@@ -21,6 +21,7 @@ from iwm_power_manager.control.repeat import advance, battery_limits
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.supervision import (
     LOCKSTEP_SUPERVISION,
+    STALE_DEMAND,
     STALE_SPEED,
     STALE_WHEELS,
     Supervision,
@@ -123,9 +124,10 @@ class Controller:
 
     @property
     def believed_speed_mps(self) -> float:
-        """Speed of the car: as its sensor shows it, or as estimated while the law does not believe the sensor."""
+        """Speed of the car: as its sensor shows it; as estimated while that is missing or not believed."""
         command = self.command
-        return command.speed_mps if command and command.doubted & DOUBT_SPEED else self.monitor.speed_mps
+        estimated = command and (self.supervision.stale & STALE_SPEED or command.doubted & DOUBT_SPEED)
+        return command.speed_mps if command and estimated else self.monitor.speed_mps
 
     def step(self, now_ns: int, dt_s: float, elapsed_s: float | None = None) -> Step:
         """One control step.
@@ -198,6 +200,8 @@ class Controller:
             speed = radius * (max(wheels, key=abs) if monitor.demand_w < 0.0 else min(wheels, key=abs))
         elif supervision.stale & STALE_WHEELS and not supervision.stale & STALE_SPEED:
             wheels = (speed / radius,) * 4
+        if supervision.stale & STALE_SPEED and not supervision.stale & STALE_DEMAND:
+            monitor.demand_speed_mps = speed  # the sensor's last one was not that of this demand
         demand = shape_demand(monitor.demand_w, monitor.demand_speed_mps, speed, supervision)
         gains, command = self.actuators.gains, self.command
         if demand > 0.0 and command and self.actuators.all_dead:

@@ -559,3 +559,36 @@ def test_the_speed_it_believes_is_the_sensors_until_that_contradicts_the_wheels(
     drive.run(300, speed=15.0, wheels=(10.0 / RADIUS,) * 4, demand=0.0)
     assert drive.commands[-1].doubted == 16
     assert drive.controller.believed_speed_mps == pytest.approx(10.0, abs=0.5)
+
+
+@pytest.mark.parametrize("demand", [-8000.0, 0.0])
+def test_with_the_speed_missing_it_believes_what_the_wheels_say(drive, demand) -> None:
+    """A pedal's force becomes power at this speed: at one that is held, braking would grow as the car slows down."""
+    drive.run(60, speed=10.0, demand=demand)
+    for step in range(150):
+        speed = 10.0 - 0.04 * step
+        drive.run(1, wheels=(speed / RADIUS,) * 4, demand=demand, without=("speed",))
+    assert drive.controller.supervision.stale == STALE_SPEED
+    assert drive.controller.believed_speed_mps == pytest.approx(speed, abs=0.1)
+    drive.run(60, speed=speed, demand=demand)
+    drive.send(speed=speed + 0.01, demand=demand)
+    assert drive.controller.believed_speed_mps == speed + 0.01
+
+
+def test_with_speed_and_wheels_missing_it_believes_the_last_speed(drive) -> None:
+    drive.run(60, speed=10.0, demand=-8000.0)
+    drive.run(60, demand=-8000.0, without=("speed", "wheels"))
+    assert drive.controller.believed_speed_mps == pytest.approx(10.0, abs=0.01)
+
+
+def test_a_brake_demand_that_is_lost_after_the_speed_keeps_its_force(drive) -> None:
+    """Its power was right at the speed that the wheels showed when it came, not at the last one of the sensor."""
+    drive.run(60, speed=20.0, demand=-8000.0)
+    for step in range(200):
+        speed = 20.0 - 0.05 * step
+        before = drive.run(1, wheels=(speed / RADIUS,) * 4, demand=-8000.0, without=("speed",))
+    after = drive.run(4, wheels=(speed / RADIUS,) * 4, without=("speed", "demand"))
+    assert after["stale"] == STALE_SPEED | STALE_DEMAND
+    assert sum(motor(after)) + sum(friction(after)) == pytest.approx(
+        sum(motor(before)) + sum(friction(before)), rel=0.03
+    )
