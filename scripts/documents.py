@@ -27,9 +27,10 @@ from iwm_power_manager.control.budget import ELASTICITY, buckets
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
+from iwm_power_manager.tools.command import plain
 from iwm_sim.study import labels, paper, unseen
 from iwm_sim.study.answers import answers, savings
-from iwm_sim.study.content import Study, rounded
+from iwm_sim.study.content import Study
 from iwm_sim.study.frontier import COUNTS, SWINGS, Frontier, margin
 from iwm_sim.study.plan import IDLE_DRIVES
 from iwm_sim.study.report import Column, format_value
@@ -210,8 +211,8 @@ def unseen_summary(frontiers: Sequence[Frontier]) -> dict[str, Any]:
         "part_above_10": sum(point.changes_per_min > 10.0 for _, point, _ in judged) / len(judged),
         "most_changes_per_min": max(point.changes_per_min for _, point, _ in judged),
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in unseen.judge(frontiers)],
-        "swings": [verdict._asdict() for verdict in unseen.judge(frontiers, (SWINGS,))],
-        "kinds": [kind._asdict() for kind in unseen.kinds(frontiers)],
+        "swings": unseen.judge(frontiers, (SWINGS,)),
+        "kinds": unseen.kinds(frontiers),
         "with_rivals": _margins([cell[2] for cell in judged if _has_rival(cell[0])]),
         "close_by_kind": {
             name: _margins([cell[2] for cell in judged if name in (unseen.kind_of(cell[0].label), "all")])
@@ -221,7 +222,7 @@ def unseen_summary(frontiers: Sequence[Frontier]) -> dict[str, Any]:
         "worst": [[margins[0], point.saving_percent, point.changes_per_min, f.label] for f, point, margins in worst],
     }
     papers_car = frontiers[0].label.partition(",")[0]
-    renamed: dict[str, Any] = json.loads(json.dumps(rounded(found)).replace(papers_car, "paper's car"))
+    renamed: dict[str, Any] = json.loads(json.dumps(plain(found, 6)).replace(papers_car, "paper's car"))
     return renamed
 
 

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import io
 import json
+import math
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +53,31 @@ def ended(name: str, work: Callable[[], int | None], *, quiet: bool = False) -> 
         return INTERRUPTED
 
 
-def write_json(path: Path | str, values: Any) -> None:
-    """Write plain values as JSON, atomically; to standard output, where the file is called -."""
-    text = json.dumps(values, indent=1, allow_nan=False)
+def plain(value: Any, digits: int = 17) -> Any:
+    """A value as JSON has it: what has fields or names as a mapping, arrays as lists, what is not finite as null.
+
+    Numbers have that many significant digits; 17 are all there are.
+    """
+    if hasattr(value, "to_json"):
+        value = value.to_json()
+    elif dataclasses.is_dataclass(value):
+        value = vars(value)
+    elif hasattr(value, "_asdict"):
+        value = value._asdict()
+    elif hasattr(value, "tolist"):  # NumPy's
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(entry, digits) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry, digits) for entry in value]
+    if isinstance(value, float):
+        return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+    return value
+
+
+def write_json(path: Path | str, value: Any) -> None:
+    """Write a value as JSON (`plain`), atomically; to standard output, where the file is called -."""
+    text = json.dumps(plain(value), indent=1)
     if str(path) == "-":
         print(text)
     else:

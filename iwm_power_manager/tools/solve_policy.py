@@ -376,9 +376,9 @@ def _numbers(chain: DemandChain, sources: Sequence[Source], solved: Sequence[Sol
     return {
         "package_version": __version__,
         "demand": {
-            "power_w": chain.power_w.tolist(),
-            "row_steps": chain.row_steps.tolist(),
-            "probability": chain.probability.tolist(),
+            "power_w": chain.power_w,
+            "row_steps": chain.row_steps,
+            "probability": chain.probability,
             "clipped": chain.clipped,
             "sources": [{"name": s.name, "sha256": s.sha256, "weight": s.weight, "steps": s.steps} for s in sources],
         },
@@ -394,7 +394,7 @@ def _numbers(chain: DemandChain, sources: Sequence[Source], solved: Sequence[Sol
                 "converged": result.policy.converged,
                 "build_s": result.build_s,
                 "solve_s": result.solve_s,
-                "iterations": [iteration._asdict() for iteration in result.policy.iterations],
+                "iterations": result.policy.iterations,
             }
             for result in solved
         ],

@@ -274,7 +274,4 @@ def make(folder: Path, page: Path, picture: Path | None = None, numbers: str | N
     if picture:
         write_picture(picture, distribution(store.table(Drive).to_pylist()))
     if numbers:
-        content = [
-            {name: None if value != value else value for name, value in one._asdict().items()} for one in savings
-        ]
-        write_json(numbers, {"savings": content})
+        write_json(numbers, {"savings": savings})

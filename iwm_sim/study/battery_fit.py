@@ -103,9 +103,8 @@ class Fit(NamedTuple):
         return f"{table}\nthe paper's estimate: {PAPER_RESISTANCE_OHM} ohm"
 
     def to_json(self) -> dict[str, Any]:
-        """The estimates as plain values, with the paper's beside them."""
-        made = {name: estimate._asdict() for name, estimate in self.estimates.items()}
-        return {**made, "paper_resistance_ohm": PAPER_RESISTANCE_OHM}
+        """The estimates, with the paper's beside them."""
+        return {**self.estimates, "paper_resistance_ohm": PAPER_RESISTANCE_OHM}
 
 
 def soc_of_model(

@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, cast, get_args, get_origin, get_type_hints
 
 from iwm_power_manager.files import read_text
+from iwm_power_manager.tools.command import plain
 from iwm_sim.study.ablation import Ablated
 from iwm_sim.study.battery_fit import Estimate
 from iwm_sim.study.criteria import Criterion
@@ -84,31 +84,13 @@ class Study:
 
     def to_json(self) -> bytes:
         """The study as JSON, numbers with six significant digits; rows without what is the same for all of them."""
-        stripped = dataclasses.replace(self, cells=_bare(self.cells), gates=_bare(self.gates))
-        return (json.dumps(rounded(stripped), indent=1, allow_nan=False) + "\n").encode()
+        values = vars(self) | {"cells": _bare(self.cells), "gates": _bare(self.gates)}
+        return (json.dumps(plain(values, 6), indent=1) + "\n").encode()
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Study:
         """A study as `to_json` gave it."""
-        values = json.loads(text)
-        return cls(
-            **values
-            | {
-                "policies": {
-                    used: [PolicyIdentity(**policy) for policy in policies]
-                    for used, policies in values["policies"].items()
-                },
-                "cells": [Row.from_json(row) for row in values["cells"]],
-                "gates": [Row.from_json(row) for row in values["gates"]],
-                "stops": [Stopped(**stop) for stop in values["stops"]],
-                "frontier": Frontier.from_json(values["frontier"]),
-                "robustness": [Robustness(**row) for row in values["robustness"]],
-                "battery_fit": {name: Estimate(**made) for name, made in values["battery_fit"].items()},
-                "paper": Consequences(**values["paper"]),
-                "ablation": [Ablated(**row) for row in values["ablation"]],
-                "criteria": [Criterion(**row) for row in values["criteria"]],
-            }
-        )
+        return read(cls, json.loads(text))
 
     @classmethod
     def load(cls, path: Path | str) -> Study:
@@ -120,20 +102,25 @@ def _bare(rows: Sequence[Row]) -> list[Row]:
     return [dataclasses.replace(row, made_with={}) for row in rows]
 
 
-def rounded(value: Any) -> Any:
-    """Plain values with six significant digits: enough for any table, and stable under the last bits; NaN is null."""
-    if isinstance(value, Row):
-        return rounded(value.to_json())
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: rounded(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): rounded(entry) for key, entry in value.items()}
-    if hasattr(value, "_asdict"):
-        return rounded(value._asdict())
-    if isinstance(value, list | tuple):
-        return [rounded(entry) for entry in value]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, float | np.floating):
-        return float(f"{value:.6g}") if np.isfinite(value) else None
-    return value
+def read[T](kind: type[T], value: Any) -> T:
+    """A value of a type as `plain` wrote it: its parts by the hints of its fields, null as NaN where a number stands.
+
+    Fields that a file of before lacks have their defaults; a tuple whose own fields stand beside the others is found.
+    """
+    made: Any = value
+    outer, of = get_origin(kind), get_args(kind)
+    hints = get_type_hints(kind) if dataclasses.is_dataclass(kind) or _is_tuple(kind) else {}
+    if hints:
+        found = {name: value.get(name, value) for name, hint in hints.items() if name in value or _is_tuple(hint)}
+        made = kind(**{name: read(hints[name], part) for name, part in found.items()})
+    elif outer is dict:
+        made = {key: read(of[1], part) for key, part in value.items()}
+    elif outer in (list, tuple):
+        made = outer(read(of[0], part) for part in value)
+    elif kind is float and value is None:
+        made = math.nan
+    return cast(T, made)
+
+
+def _is_tuple(kind: Any) -> bool:
+    return hasattr(kind, "_fields")

@@ -15,7 +15,7 @@ from iwm_sim.closed_loop import Run
 from iwm_sim.metrics import MOVING_MPS, Metrics
 from iwm_sim.study.report import Block, Chart, Column, Page, Panel, Series, Settings, Table, Text, Tile, Tiles, Verdict
 from iwm_sim.study.report import format_value as shown
-from iwm_sim.study.rows import finite, saving_percent
+from iwm_sim.study.rows import saving_percent
 
 BLUE, VERMILION, GREEN, PURPLE, OCHRE, SKY, GREY, BLACK = range(8)
 #: Below it a car stands.
@@ -57,11 +57,11 @@ class DriveRow:
     share_changes_per_min: float | None
 
     def to_json(self) -> dict[str, Any]:
-        """The row as flat plain values; JSON knows no NaN, so what is missing is null."""
+        """The row as a flat mapping."""
         return {
             "strategy": self.strategy,
             "made": self.made,
-            **{name: finite(value) for name, value in self.metrics._asdict().items()},
+            **self.metrics._asdict(),
             "distance_km": self.metrics.distance_m / 1000.0,
             "saving_percent": self.saving_percent,
             "share_changes_per_min": self.share_changes_per_min,
@@ -91,7 +91,7 @@ def row(driven: Driven, reference: Driven) -> DriveRow:
         made=driven.made,
         metrics=driven.metrics,
         saving_percent=None if driven is reference else saving_percent(driven.metrics, reference.metrics),
-        share_changes_per_min=finite(driven.metrics.share_changes_per_min) if known else None,
+        share_changes_per_min=driven.metrics.share_changes_per_min if known else None,
     )
 
 

@@ -15,8 +15,8 @@ another strategy did can be known in advance as well, so the bound is never belo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -130,17 +130,6 @@ class Frontier(NamedTuple):
     def points(self) -> tuple[Point, ...]:
         """All of them."""
         return (*self.rivals, *self.ours, *self.bounds)
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        points = {name: [point._asdict() for point in getattr(self, name)] for name in ("rivals", "ours", "bounds")}
-        return {"label": self.label, "made_with": self.made_with, **points}
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Frontier:
-        """A frontier as `to_json` gave it."""
-        rivals, ours, bounds = (tuple(Point(**p) for p in values[name]) for name in ("rivals", "ours", "bounds"))
-        return cls(values["label"], values["made_with"], rivals, ours, bounds)
 
 
 class _Reference(NamedTuple):

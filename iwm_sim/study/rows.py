@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -63,37 +62,17 @@ class Row:
         return self.saving_percent / self.share_of_possible if self.saving_percent and self.share_of_possible else None
 
     def to_json(self) -> dict[str, Any]:
-        """The row as flat plain values; what was not measured is null."""
-        return {
-            **self.place._asdict(),
-            "label": self.label,
-            "strategy": self.strategy,
-            **{name: finite(value) for name, value in self.metrics._asdict().items()},
-            "saving_percent": self.saving_percent,
-            "share_of_possible": self.share_of_possible,
-            "same_distance_as_equal": self.same_distance_as_equal,
-            **self.made_with,
-        }
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Row:
-        """A row as `to_json` gave it, without what it was made with."""
-        measured: dict[str, Any] = {
-            name: math.nan if values[name] is None else values[name] for name in Metrics._fields
-        }
-        return cls(
-            place=Place(*(values[name] for name in Place._fields)),
-            metrics=Metrics(**measured),
-            **{name: values[name] for name in _PLAIN},
-        )
-
-
-_PLAIN = ("label", "strategy", "saving_percent", "share_of_possible", "same_distance_as_equal")
-
-
-def finite(value: float) -> float | None:
-    """A number as JSON takes it: NaN (nothing was driven) is null."""
-    return value if isinstance(value, bool) or math.isfinite(value) else None
+        """The row as a flat mapping."""
+        flat: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            flat |= (
+                value._asdict()
+                if isinstance(value, Place | Metrics)
+                else value
+                if name == "made_with"
+                else {name: value}
+            )
+        return flat
 
 
 def comparable(one: Metrics, other: Metrics) -> bool:

@@ -224,11 +224,11 @@ def common(frontiers: Sequence[Frontier]) -> str:
 
 
 def to_json(frontiers: Sequence[Frontier]) -> dict[str, Any]:
-    """Everything measured, as plain values."""
+    """Everything measured."""
     return {
         "package_version": __version__,
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in judge(frontiers)],
-        "swings": [verdict._asdict() for verdict in judge(frontiers, (SWINGS,))],
-        "kinds": [kind._asdict() for kind in kinds(frontiers)],
-        "cells": [f.to_json() for f in frontiers],
+        "swings": judge(frontiers, (SWINGS,)),
+        "kinds": kinds(frontiers),
+        "cells": frontiers,
     }

@@ -100,7 +100,7 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
         remarks=remarks,
     )
     write_page(plan.output / "drive.html", page)
-    content = {"rows": [made.to_json() for made in rows], "settings": settings, "remarks": remarks}
+    content = {"rows": rows, "settings": settings, "remarks": remarks}
     command.write_json(plan.output / "result.json", content)
     if plan.json:
         command.write_json(plan.json, content)

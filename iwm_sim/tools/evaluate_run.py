@@ -67,8 +67,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             print(line)
         say(f"{len(rows)} cases in {time.perf_counter() - started:.1f} s")
     if options.json:
-        content = {"package_version": __version__, "rows": [row.to_json() for row in rows]}
-        write_json(options.json, content)
+        write_json(options.json, {"package_version": __version__, "rows": rows})
         say(f"rows: {options.json}")
 
 
@@ -234,7 +233,7 @@ def _paper(options: argparse.Namespace) -> None:
             print(f"{title}\n{plain_table(table.rows, table.columns, screen())}\n")
         print(f"{textwrap.fill(table.note, screen())}\n{_policies_text(policies)}")
     if options.json:
-        rows = [row.to_json() for table in tables for cell in table.rows for row in cell.values()]
+        rows = [row for table in tables for cell in table.rows for row in cell.values()]
         write_json(options.json, {"package_version": __version__, "table": options.paper, "rows": rows})
 
 
@@ -268,8 +267,7 @@ def _ablation(options: argparse.Namespace) -> None:
         note = textwrap.fill(ABLATION_NOTE, screen())
         print(f"{plain_table(rows, ablation.columns(rows), screen())}\n{note}\n{_policies_text(policies)}")
     if options.json:
-        content = {"package_version": __version__, "rows": [dataclasses.asdict(row) for row in rows]}
-        write_json(options.json, content)
+        write_json(options.json, {"package_version": __version__, "rows": rows})
 
 
 def _fit_battery(options: argparse.Namespace) -> None:
@@ -287,7 +285,7 @@ def _fit_battery(options: argparse.Namespace) -> None:
         write_picture(options.plot, battery_figure(fit).captioned())
         tell(f"picture: {options.plot}")
     if options.json:
-        write_json(options.json, fit.to_json())
+        write_json(options.json, fit)
 
 
 def _scenario(options: argparse.Namespace) -> None:

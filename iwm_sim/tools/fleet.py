@@ -146,8 +146,7 @@ def _run(options: argparse.Namespace) -> None:
                 print(f"{name}: {summary.tasks} tasks, {summary.known} known before, {summary.batches} batches{rate}")
         print(f"study: {options.output}; its page: fleet report {options.output}")
     if options.json:
-        content = {"package_version": __version__} | {name: summary._asdict() for name, summary in made.items()}
-        write_json(options.json, content)
+        write_json(options.json, {"package_version": __version__, **made})
 
 
 def _check_options(options: argparse.Namespace, solves: bool, drives_policies: bool) -> None:

@@ -40,7 +40,7 @@ def test_margins_by_swings_stand_beside_the_judgement_and_are_no_part_of_it():
     assert swings.worst == pytest.approx(0.1)
     assert [verdict.worst for verdict in unseen.judge([blind])] == pytest.approx([-0.2, -0.2, -0.2])
     assert "swings_per_min, no part of the target: worst +0.100 points" in unseen.report([blind])
-    assert unseen.to_json([blind])["swings"] == [swings._asdict()]
+    assert unseen.to_json([blind])["swings"] == [swings]
     before = blind._replace(ours=(point(0.3, 5.0),))  # of a file without them
     assert unseen.judge([before], (frontier.SWINGS,)) == []
 
@@ -80,7 +80,7 @@ def test_what_ours_saves_is_said_by_kind_of_cell():
     assert (row.margin, row.worst_margin) == (pytest.approx(0.0), pytest.approx(-0.2))
     assert row.worst < row.low < row.high < 0.5
     assert (rows["all"].cells, rows["all"].worst, rows["drawn cars"].worst_margin) == (4, -0.4, pytest.approx(-0.7))
-    assert unseen.to_json(found)["kinds"][-1]["name"] == "all"
+    assert unseen.to_json(found)["kinds"][-1].name == "all"
 
 
 def test_a_report_says_what_its_cells_were_made_with():

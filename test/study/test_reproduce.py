@@ -6,8 +6,9 @@ import shutil
 import pytest
 
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.tools.command import plain
 from iwm_sim.study import cases, paper, plan, policies, reproduce
-from iwm_sim.study.content import Study, rounded
+from iwm_sim.study.content import Study
 
 
 def test_a_folder_that_cannot_be_made_is_refused_at_once(tmp_path):
@@ -17,7 +18,7 @@ def test_a_folder_that_cannot_be_made_is_refused_at_once(tmp_path):
 
 
 def test_numbers_keep_six_digits_and_nan_becomes_null():
-    made = rounded({"a": [1.23456789, float("nan")], "b": True, 3: "x"})
+    made = plain({"a": [1.23456789, float("nan")], "b": True, 3: "x"}, 6)
     assert made == {"a": [1.23457, None], "b": True, "3": "x"}
 
 

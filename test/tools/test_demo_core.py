@@ -14,6 +14,7 @@ from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.cycle import make_cycle
 from iwm_power_manager.nodes import power_manager_config
 from iwm_power_manager.share import resolve
+from iwm_power_manager.tools.command import plain
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import closed_loop, dds_drive, metrics, simulator
 from iwm_sim.closed_loop import COLUMNS, Run
@@ -223,7 +224,7 @@ def test_rows_of_a_car_that_never_moved_are_still_json():
     standing = make_cycle("standing", [0.0, 1.0], [0.0, 0.0])
     run = closed_loop.run(standing, vehicle, default_settings("equal"), empty_table(), 0.9)
     driven = Driven("equal", "one process", run, metrics.measure(run, vehicle.params))
-    assert json.loads(json.dumps(row(driven, driven).to_json(), allow_nan=False))["wh_per_km"] is None
+    assert json.loads(json.dumps(plain(row(driven, driven)), allow_nan=False))["wh_per_km"] is None
 
 
 def test_simulator_and_demo_agree_on_the_rate_a_command_line_can_give():
