@@ -39,13 +39,14 @@ def jobs() -> Iterator[Job]:
     from iwm_power_manager.control.thresholds import Thresholds, for_car
     from iwm_power_manager.control.types import Measurement, initial_state
     from iwm_power_manager.cycle import Cycle
+    from iwm_power_manager.files import read_yaml
     from iwm_power_manager.held import Held
     from iwm_power_manager.mdp.demand import chain_of, cycle_source, driven_source
     from iwm_power_manager.mdp.problem import problem_from
     from iwm_power_manager.model.limits import battery_limits_w
     from iwm_power_manager.policy import load_policy
     from iwm_power_manager.share import resolve
-    from iwm_power_manager.solve import solve_one
+    from iwm_power_manager.solve import grid_path, solve_one
     from iwm_power_manager.vehicle import load_vehicle
     from iwm_sim import closed_loop, preview
     from iwm_sim.drive import Drive
@@ -82,7 +83,9 @@ def jobs() -> Iterator[Job]:
         preview.cheapest_schedule(cost, share)
 
     def solver() -> None:
-        problem = problem_from(_smallest_grid(), "precompile")
+        axes = {"power_w": [-1000, 0, 1000], "speed_mps": [0, 2], "share": [0, 0.5, 1]}
+        quick = {"dt_s": 1.0, "discount": 0.5, "tolerance_j": 1.0}
+        problem = problem_from(read_yaml(grid_path("coupled")) | axes | quick, "precompile")
         for source in (cycle_source(cycle, problem.dt_s, vehicle.params), driven_source(cycle, 0.1, vehicle.params)):
             chain = chain_of(problem, [source])
         with tempfile.TemporaryDirectory() as folder:
@@ -99,31 +102,6 @@ def compile_for_a_drive() -> None:
     """What nodes and a drive in one process call: here, where it is shown, and once for all of them."""
     for _, job in itertools.islice(jobs(), 3):
         job()
-
-
-def _smallest_grid() -> dict[str, object]:
-    return {
-        "format": 1,
-        "power_w": [-1000, 0, 1000],
-        "speed_mps": [0, 2],
-        "slip_front": [0],
-        "slip_rear": [0],
-        "share": [0, 0.5, 1],
-        "previous_share": True,
-        "dt_s": 1.0,
-        "discount": 0.5,
-        "alpha": 20,
-        "power_error": "road",
-        "error_norm": "absolute",
-        "slip_model": "quasi_steady",
-        "skid_avoidance": "none",
-        "switching_cost_by_friction": [[0.9, 36]],
-        "demand_by_speed": True,
-        "cycle_demand": "driven",
-        "speed_bandwidth_mps": 1.0,
-        "prior_steps": 1,
-        "tolerance_j": 1.0,
-    }
 
 
 def parser() -> argparse.ArgumentParser:

@@ -24,6 +24,13 @@ from iwm_power_manager.tools import solve_policy
 solve_policy.main(["--vehicle", "jalalmaab_2015", "--cycle", CYCLE, "--friction", "0.9", "--grid", GRID,
                    "--output", OUTPUT, "--quiet"])
 """,
+    "solve_policy with a budget of changes": """\
+from iwm_power_manager.files import atomic_write, read_text
+from iwm_power_manager.tools import solve_policy
+atomic_write(OUTPUT + ".yaml", (read_text(GRID) + "changes_per_min: 8\\n").encode())
+solve_policy.main(["--vehicle", "jalalmaab_2015", "--cycle", CYCLE, "--friction", "0.9", "--grid", OUTPUT + ".yaml",
+                   "--output", OUTPUT, "--quiet"])
+""",
     "power_manager": """\
 import rclpy
 from iwm_power_manager.nodes.power_manager_node import PowerManager
