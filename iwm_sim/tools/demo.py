@@ -79,15 +79,22 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
         choices=["", *IDLE_DRIVES],
         help=f"what a motor at zero torque costs: {', '.join(IDLE_DRIVES)} (default: as the car's file says)",
     )
-    parser.add_argument("--rate", metavar="HZ", default=50.0, type=number(10.0, 1000.0), help=f"control rate {shown}")
+    parser.add_argument(
+        "--rate", dest="rate_hz", metavar="HZ", default=50.0, type=number(10.0, 1000.0), help=f"control rate {shown}"
+    )
     parser.add_argument(
         "--soc", metavar="SOC", default=0.8, type=number(0.0, 1.0), help=f"state of charge at the start, 0..1 {shown}"
     )
     parser.add_argument(
-        "--until", metavar="S", default=0.0, type=number(0.0, 1e6), help="drive only its first S seconds (default: all)"
+        "--until",
+        dest="until_s",
+        metavar="S",
+        default=0.0,
+        type=number(0.0, 1e6),
+        help="drive only its first S seconds (default: all)",
     )
     parser.add_argument("--realtime", action="store_true", help="in real time instead of lock-step")
-    parser.add_argument("--no-record", action="store_true", help="without the recorder")
+    parser.add_argument("--no-record", dest="record", action="store_false", help="without the recorder")
     parser.add_argument(
         "--output", metavar="DIR", type=Path, help="folder for everything that is made (default: runs/<date and time>)"
     )
@@ -103,23 +110,8 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
     parser.check(given, of_cycle | {"--policy": with_policy})
     from iwm_sim.dds_drive import Plan  # `--help` needs no DDS
 
-    return Plan(
-        cycle=given.cycle,
-        vehicle=given.vehicle,
-        policy=given.policy,
-        strategy=given.strategy,
-        friction=given.friction,
-        idle_drive=given.idle_drive,
-        rate_hz=given.rate,
-        soc=given.soc,
-        until_s=given.until,
-        realtime=given.realtime,
-        record=not given.no_record,
-        output=given.output or Path("runs") / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"),
-        json=given.json,
-        scenario=given.scenario,
-        animate=given.animate,
-    )
+    given.output = given.output or Path("runs") / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    return Plan(**{name: getattr(given, name) for name in Plan.__dataclass_fields__})
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
