@@ -3,20 +3,15 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iwm_power_manager.files import atomic_write
+from iwm_power_manager.tools.command import write_picture
 from iwm_sim.study.frontier import COUNTS, RIVAL, Frontier, Point, margin
 from iwm_sim.study.palette import COLOURS
 
@@ -29,7 +24,8 @@ _NAMES = {
 
 def draw_frontier(frontier: Frontier, path: Path) -> None:
     """Saving of ours, its rivals and the bound against each way of counting changes."""
-    figure, axes = plt.subplots(1, len(COUNTS), figsize=(12.0, 4.0), sharey=True, layout="constrained")
+    figure = Figure(figsize=(12.0, 4.0), layout="constrained")
+    axes = figure.subplots(1, len(COUNTS), sharey=True)
     for axis, count in zip(axes, COUNTS, strict=True):
         families = (
             (f"{RIVAL}, thresholds", [p for p in frontier.rivals if p.strategy == RIVAL], COLOURS[1], "o-"),
@@ -47,7 +43,7 @@ def draw_frontier(frontier: Frontier, path: Path) -> None:
     policies = ", ".join(point.policy for point in frontier.ours)
     words = textwrap.fill(f"{frontier.made_with}; policies of ours: {policies}", 150)
     figure.suptitle(f"{frontier.label}\n{words}", fontsize="medium")
-    _save(figure, path)
+    write_picture(path, figure)
 
 
 def _curve(axis: Axes, name: str, points: Sequence[Point], count: str, colour: str, style: str) -> None:
@@ -64,7 +60,8 @@ def _curve(axis: Axes, name: str, points: Sequence[Point], count: str, colour: s
 
 def draw_margins(frontiers: Sequence[Frontier], path: Path) -> None:
     """All cells' margins, sorted, for each way of counting changes."""
-    figure, axis = plt.subplots(figsize=(8.0, 4.0), layout="constrained")
+    figure = Figure(figsize=(8.0, 4.0), layout="constrained")
+    axis = figure.subplots()
     for count, colour in zip(COUNTS, COLOURS, strict=False):
         found = (margin(point, f.rivals, count) for f in frontiers for point in f.ours)
         known = np.sort([value for value in found if value is not None])
@@ -75,11 +72,4 @@ def draw_margins(frontiers: Sequence[Frontier], path: Path) -> None:
     axis.set_ylabel("saving minus the best rival's with no more changes, points")
     axis.legend(frameon=False)
     axis.grid(alpha=0.3)
-    _save(figure, path)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    stream = io.BytesIO()
-    figure.savefig(stream, format=path.suffix.removeprefix(".") or "svg")
-    plt.close(figure)
-    atomic_write(path, stream.getvalue())
+    write_picture(path, figure)
