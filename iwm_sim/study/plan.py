@@ -58,14 +58,21 @@ class Policies:
     Parameters
     ----------
     vehicle, policy : car, and folder or file of our policies for it
-    say : told, in one line, of everything that is solved
+    say, grid, may_solve : as in `PolicySource`
 
     `used` holds what was asked for, by name, idle drive and friction.
     """
 
-    def __init__(self, vehicle: str, policy: str, say: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(
+        self,
+        vehicle: str,
+        policy: str,
+        say: Callable[[str], None] = lambda _: None,
+        grid: str = "",
+        may_solve: bool = True,
+    ) -> None:
         self.vehicle = vehicle
-        self._source = PolicySource(policy, say=say)
+        self._source = PolicySource(policy, grid, may_solve, say)
         self._say = say
         self.used: dict[tuple[str, str, float], str] = {}
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
+import itertools
 import tempfile
 import textwrap
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from iwm_power_manager import __version__
@@ -30,7 +30,6 @@ from iwm_sim.study.cases import POLICY_STRATEGIES, Case, Result, SensorNoise
 from iwm_sim.study.driving import Progress, drive_all, silent, tell, warm_up, with_rules
 from iwm_sim.study.names import REFERENCE
 from iwm_sim.study.plan import Policies
-from iwm_sim.study.policies import PolicySource
 from iwm_sim.study.rows import Row, rows_of
 from iwm_sim.study.study_figures import battery_figure
 from iwm_sim.study.study_tables import ABLATION_NOTE, TABLES
@@ -41,6 +40,7 @@ from iwm_sim.tools.precompile import compile_for_a_drive
 
 def run(mode: str, options: argparse.Namespace) -> None:
     """Do what is asked for; `mode` is a key of `evaluate.MODES`, or "" for single cases."""
+    options.say = silent if options.quiet else tell
     _RUN[mode](options)
 
 
@@ -51,10 +51,9 @@ def _evaluate(options: argparse.Namespace) -> None:
     if not options.cycle:
         raise ConfigError("arguments", "--cycle", "is missing", "one drive cycle or more, for instance nycc")
     started = time.perf_counter()
-    say = silent if options.quiet else tell
-    wanted = planned(options, say)
+    wanted = planned(options)
     for line in _doubts(wanted):
-        say(f"evaluate: {line}")
+        options.say(f"evaluate: {line}")
     with Progress(len(wanted), options.quiet) as progress:
         warm_up(wanted)
         wanted = with_rules(wanted, options.jobs)
@@ -65,10 +64,10 @@ def _evaluate(options: argparse.Namespace) -> None:
         print(text_table(rows, screen()))
         for line in remarks(rows):
             print(line)
-        say(f"{len(rows)} cases in {time.perf_counter() - started:.1f} s")
+        options.say(f"{len(rows)} cases in {time.perf_counter() - started:.1f} s")
     if options.json:
         write_json(options.json, {"package_version": __version__, "rows": rows})
-        say(f"rows: {options.json}")
+        options.say(f"rows: {options.json}")
 
 
 def _doubts(wanted: Sequence[Case]) -> list[str]:
@@ -81,58 +80,48 @@ def _doubts(wanted: Sequence[Case]) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
-def planned(options: argparse.Namespace, say: Callable[[str], None]) -> list[Case]:
+def planned(options: argparse.Namespace) -> list[Case]:
     """The cases of a command line, each checked, with their policies found or solved. Equal split is always there."""
     if options.save_series:
         _folder(options.save_series)
     strategies = list(dict.fromkeys([REFERENCE, *(options.strategy or [DEFAULT_STRATEGY])]))
     settings = _settings(options)
     result: list[tuple[str, Case]] = []
-    for idle_drive in dict.fromkeys(options.idle_drive or [""]):
-        vehicle = cases.vehicle_of(options.vehicle, idle_drive)
-        for cycle in dict.fromkeys(options.cycle):
-            for friction in dict.fromkeys(options.friction or [0.9]):
-                base = Case(
-                    cycle=cycle,
-                    vehicle=options.vehicle,
-                    idle_drive=vehicle.idle_drive,
-                    friction=friction,
-                    strategy=REFERENCE,
-                    settings=settings,
-                    dt_s=options.dt,
-                    substeps=options.substeps,
-                    soc=options.initial_soc,
-                    assumed_friction=options.assumed_friction,
-                    noise=SensorNoise(options.noise[0], options.noise[1], options.seed),
-                )
-                for name in strategies:
-                    known = VARIANTS[name].case(base, name) if name in VARIANTS else None
-                    result.append((name, known or dataclasses.replace(base, strategy=name)))
-                    cases.check(result[-1][1])
+    for idle_drive, cycle, friction, name in itertools.product(
+        options.idle_drive or [""], options.cycle, options.friction or [0.9], strategies
+    ):
+        base = Case(
+            cycle=cycle,
+            vehicle=options.vehicle,
+            idle_drive=cases.vehicle_of(options.vehicle, idle_drive).idle_drive,
+            friction=friction,
+            strategy=REFERENCE,
+            settings=settings,
+            dt_s=options.dt,
+            substeps=options.substeps,
+            soc=options.initial_soc,
+            assumed_friction=options.assumed_friction,
+            noise=SensorNoise(options.noise[0], options.noise[1], options.seed),
+        )
+        known = VARIANTS[name].case(base, name) if name in VARIANTS else None
+        result.append((name, known or dataclasses.replace(base, strategy=name)))
+        cases.check(result[-1][1])
     # Policies last: a wrong cycle must not be found after a minute of solving.
-    source = PolicySource(options.policy, options.grid, not options.no_solve, say)
-
-    @functools.cache
-    def find(idle_drive: str, friction: float) -> str:
-        return source.find(cases.vehicle_of(options.vehicle, idle_drive), friction)
-
-    policies = Policies(options.vehicle, options.policy, say)
-    return [_with_policy(name, case, options, find, policies) for name, case in result]
+    policies = Policies(options.vehicle, options.policy, options.say, options.grid, not options.no_solve)
+    return [_with_policy(name, case, options, policies) for name, case in dict.fromkeys(result)]
 
 
-def _with_policy(
-    name: str, case: Case, options: argparse.Namespace, find: Callable[[str, float], str], policies: Policies
-) -> Case:
+def _with_policy(name: str, case: Case, options: argparse.Namespace, policies: Policies) -> Case:
     if name in VARIANTS:
         return dataclasses.replace(case, policy=policies.of_variant(name, case.idle_drive, case.law_friction))
     if name in POLICY_STRATEGIES and options.friction_source == "estimated":
         return dataclasses.replace(case, policies=options.policy, label=f"{name}, friction estimated")
     if name in POLICY_STRATEGIES:
-        return dataclasses.replace(case, policy=find(case.idle_drive, case.law_friction))
+        return dataclasses.replace(case, policy=policies.ours(case.idle_drive, case.law_friction))
     if name != "preview":
         return case
     if options.switching_cost is None:
-        case = cases.priced_as(case, find(case.idle_drive, case.law_friction))
+        case = cases.priced_as(case, policies.ours(case.idle_drive, case.law_friction))
     else:
         case = dataclasses.replace(case, switching_cost_j=options.switching_cost)
     return dataclasses.replace(case, label=f"preview, {case.price_text}")
@@ -220,12 +209,11 @@ def _study(options: argparse.Namespace) -> None:
 
 
 def _paper(options: argparse.Namespace) -> None:
-    say = silent if options.quiet else tell
     cycles = list(dict.fromkeys(options.cycle or paper.CYCLES))
     idle_drives = list(dict.fromkeys(options.idle_drive or ("none", "drag")))
     for cycle in cycles:
         cases.cycle_of(cycle)
-    policies = Policies(options.vehicle, options.policy, say)
+    policies = Policies(options.vehicle, options.policy, options.say)
     tables = single.paper_table(options.paper, policies, cycles, idle_drives, options.jobs, options.quiet)
     if not options.quiet:
         for table in tables:
@@ -249,7 +237,7 @@ def _policies_text(policies: Policies) -> str:
 def _figure(options: argparse.Namespace) -> None:
     if not options.plot:
         raise ConfigError("arguments", "--plot", "is missing", f"a file that ends in {', '.join(PICTURES)}")
-    policies = Policies(options.vehicle, options.policy, silent if options.quiet else tell)
+    policies = Policies(options.vehicle, options.policy, options.say)
     drawn = single.figure(options.figure, policies, options.jobs)
     write_picture(options.plot, drawn.captioned())
     if not options.quiet:
@@ -259,10 +247,9 @@ def _figure(options: argparse.Namespace) -> None:
 
 
 def _ablation(options: argparse.Namespace) -> None:
-    say = silent if options.quiet else tell
-    policies = Policies(options.vehicle, options.policy, say)
+    policies = Policies(options.vehicle, options.policy, options.say)
     with tempfile.TemporaryDirectory(prefix="iwm-ablation-") as folder:
-        rows = ablation.ablation(policies, Path(folder), options.jobs, say, quiet=options.quiet)
+        rows = ablation.ablation(policies, Path(folder), options.jobs, options.say, quiet=options.quiet)
     if not options.quiet:
         note = textwrap.fill(ABLATION_NOTE, screen())
         print(f"{plain_table(rows, ablation.columns(rows), screen())}\n{note}\n{_policies_text(policies)}")
@@ -343,9 +330,8 @@ def _unseen(options: argparse.Namespace) -> None:
     wanted = unseen.cells(options.vehicle, idle_drive, options.seeds, options.cycles, options.cars)
     if not wanted:
         raise ConfigError("arguments", "--unseen", "has neither cycles nor cars", "--cycles or --cars")
-    say = silent if options.quiet else tell
     started = time.perf_counter()
-    say(f"{len(wanted)} cells from seed {options.seeds} on; policies for cars of their own are solved first")
+    options.say(f"{len(wanted)} cells from seed {options.seeds} on; policies for cars of their own are solved first")
     compile_for_a_drive()
     with Bar(len(wanted), "cells", quiet=options.quiet) as bar:
         made = on_all_cores(unseen.drive_cell, wanted, options.jobs, lambda _: bar.update())
