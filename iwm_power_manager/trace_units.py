@@ -145,10 +145,10 @@ def implausible(time_s: FloatArray, speed_mps: FloatArray) -> tuple[int, str] | 
     return at, problem
 
 
-def apart(shown: float, rolled: float, radius_m: float) -> str:
-    """A line, if a speed and that of the wheels' rims cannot both be in the unit they were read in; "" else."""
+def apart(shown: float, rolled: float, radius_m: float, least: float = _APART) -> str:
+    """A line, if a speed is `least` times that of the wheels' rims, or they of it: which unit was meant; "" else."""
     ratio = shown / rolled if rolled else math.inf
-    if 1.0 / _APART < ratio < _APART:
+    if 1.0 / least < ratio < least:
         return ""
     likely = {**_LIKELY, 1.0 / radius_m: "wheel_speed in m/s"}
     meant = [text for factor, text in likely.items() if math.isclose(ratio, factor, rel_tol=_NEAR)]

@@ -281,7 +281,8 @@ class InputMonitor:
     def apart(self) -> str:
         """By what factor `vehicle_speed` and the wheels contradict each other, and the unit probably meant; or ""."""
         speed, *rims = map(abs, self.shown_mps)
-        return apart(speed, sum(rims) / len(rims), self._limits.radius_m) if max(speed, *rims) > _MOVING_MPS else ""
+        moving = max(speed, *rims) > _MOVING_MPS
+        return apart(speed, sum(rims) / len(rims), self._limits.radius_m, 1.0 + _SAME) if moving else ""
 
     def take_speed(self, reading: SpeedReading, now_ns: int) -> bool:
         """Judge `vehicle_speed`; True if it was accepted."""

@@ -564,6 +564,7 @@ class TestApart:
             (10.0, (19.0, 20.0, 21.0, 20.0), ""),
             (0.1, (3.0, 3.0, 3.0, 3.0), ""),
             (36.0, (20.0, 20.0, 20.0, 20.0), "speed is 3.6 times what wheel_speed"),
+            (12.0, (20.0, 20.0, 20.0, 20.0), "speed is 1.2 times what wheel_speed"),
             (10.0, (0.0, 0.0, 0.0, 0.0), "speed is inf times what wheel_speed"),
         ],
     )
