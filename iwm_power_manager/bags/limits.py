@@ -8,6 +8,7 @@ Neither library has such limits: `rosbags` and `mcap` decompress whatever a fram
 from __future__ import annotations
 
 import io
+import os
 import shutil
 import stat
 from contextlib import suppress
@@ -52,10 +53,10 @@ _ZSTD = zstandard.ZstdDecompressor(max_window_size=1 << 27)
 _DAMAGED = (zstandard.ZstdError, RuntimeError, EOFError, MemoryError)
 
 
-def check_exists(path: Path) -> None:
-    """Refuse a path that is nowhere, or that nobody may look at, with the reason; `BagError`."""
+def check_exists(path: Path) -> os.stat_result:
+    """What is known of a path; `BagError`, with the reason, if it is nowhere, or nobody may look at it."""
     try:
-        path.stat()
+        return path.stat()
     except FileNotFoundError:
         raise BagError(f"{path}: does not exist{did_you_mean(path)}") from None
     except (OSError, ValueError) as error:  # the latter for names no file can have
@@ -70,12 +71,9 @@ def regular_file(path: Path, folder: Path | None = None) -> int:
     BagError
         It is missing, a device, a pipe, a folder, or a link that leads out of the folder.
     """
-    try:
-        status = path.stat()
-        if folder is not None and not path.resolve().is_relative_to(folder.resolve()):
-            raise BagError(f"{path}: leads out of the bag")
-    except (OSError, ValueError, RuntimeError) as error:  # the latter for names no file can have, and circles of links
-        raise BagError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    status = check_exists(path)
+    if folder is not None and not path.resolve().is_relative_to(folder.resolve()):
+        raise BagError(f"{path}: leads out of the bag")
     if not stat.S_ISREG(status.st_mode):
         raise BagError(f"{path}: is no regular file")
     return status.st_size

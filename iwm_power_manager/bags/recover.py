@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
@@ -132,12 +132,13 @@ def recover(path: Path | str) -> Recovery:
     with ExitStack() as stack:
         files: list[_File] = []
         left_out: list[FileRecovery] = []
-        names, gaps = _names(path), _Gaps()
+        names = _names(path)
+        missing, last = Counter[str](), dict[str, int]()
         for name in names:
             try:
                 regular_file(name, folder)
                 name.name.encode()
-                files.append(_File(name, stack, gaps))
+                files.append(_File(name, stack, missing, last))
             except UnicodeEncodeError:
                 why = f"{name}: its name is no UTF-8 text, which metadata.yaml could not hold: rename it"
                 left_out.append(FileRecovery(name.name, False, 0, why))
@@ -160,7 +161,7 @@ def recover(path: Path | str) -> Recovery:
         return Recovery(
             path,
             [file.report for file in files] + left_out,
-            dict(+gaps.missing),
+            dict(+missing),
             min((file.seen.start_ns for file in files if file.seen.count), default=0),
             max(file.seen.end_ns for file in files),
             stale,
@@ -184,22 +185,13 @@ def _names(path: Path) -> list[Path]:
     return names
 
 
-class _Gaps:
-    """By topic, the publisher's numbers left out in files and between them, as the messages are taken."""
-
-    def __init__(self) -> None:
-        self.missing: Counter[str] = Counter()
-        self._last: dict[str, int] = {}
-
-    def take(self, topic: str, sequence: int) -> None:
-        self.missing[topic] += max(sequence - self._last.get(topic, sequence) - 1, 0)
-        self._last[topic] = sequence
-
-
 class _Seen:
-    """All messages of a file, read and counted: by channel, in all, the first and the last, compressed one by one."""
+    """All messages of a file, read and counted: by channel, in all, the first and the last, compressed one by one.
 
-    def __init__(self, source: mcap_source.Source, gaps: _Gaps) -> None:
+    By topic, `last` is the publisher's number, from file to file, and `missing` are those left out before it.
+    """
+
+    def __init__(self, source: mcap_source.Source, missing: Counter[str], last: dict[str, int]) -> None:
         self.source = source
         self.topics = source.topics
         self.counts: Counter[int] = Counter()
@@ -211,7 +203,9 @@ class _Seen:
             start_ns, self.end_ns = min(start_ns, log_time), max(self.end_ns, log_time)
             self.compression = self.compression or PACKED.get(data[:4], "")
             if sequence and own and channel in self.topics:
-                gaps.take(self.topics[channel].name, sequence)
+                name = self.topics[channel].name
+                missing[name] += max(sequence - last.get(name, sequence) - 1, 0)
+                last[name] = sequence
         self.count = self.counts.total()
         self.start_ns = start_ns if self.count else 0
 
@@ -219,13 +213,13 @@ class _Seen:
 class _File:
     """A data file and what becomes of it: what is wrong with it, and what was found, at last in the rebuilt one."""
 
-    def __init__(self, path: Path, stack: ExitStack, gaps: _Gaps) -> None:
+    def __init__(self, path: Path, stack: ExitStack, *gaps: Any) -> None:
         self._stack = stack
         self.path = path
         self.is_compressed = path.suffix in reader.COMPRESSED_SUFFIXES
         self._temporary: Path | None = None
         opened, problem = _opened(path, stack)
-        self.seen = _Seen(reader.open_source(opened, path, stack), gaps)
+        self.seen = _Seen(reader.open_source(opened, path, stack), *gaps)
         self.is_sqlite = isinstance(self.seen.source, SqliteSource)
         found = self.seen.source.damage[:3]
         if self.seen.counts.keys() - self.seen.topics.keys():
@@ -245,7 +239,7 @@ class _File:
             temporary.unlink(missing_ok=True)
             self._stack.callback(temporary.unlink, missing_ok=True)
             copy = _Copy(self.seen.source, temporary)
-            made = _Seen(reader.open_source(temporary, target, self._stack), _Gaps())
+            made = _Seen(reader.open_source(temporary, target, self._stack), Counter(), {})
         if made.source.damage or made.count < self.seen.count:
             raise BagError(
                 f"{temporary}: holds {made.count} of {self.seen.count} messages; the original is left as it is"

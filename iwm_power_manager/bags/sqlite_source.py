@@ -11,7 +11,8 @@ instructions.
 from __future__ import annotations
 
 import sqlite3
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -69,13 +70,18 @@ class SqliteSource(Source):
 
     def unpack(self, piece: Piece) -> list[ChannelMessage]:
         """Messages of a range of rows up to one that cannot be read."""
-        messages: list[ChannelMessage] = []
+        return [(log_time, number, data, log_time, 0) for _, number, log_time, data in self._rows("data", *piece.place)]
+
+    def _rows(self, what: str, first: int, last: int) -> Iterator[tuple[int, int, int, Any]]:
+        """Number, topic, time and something else of rows in a range, as far as they can be read."""
+        query, row = _ROWS.format(what), (first - 1,)
         try:
-            for _, number, log_time, data in self._database.execute(_ROWS.format("data"), piece.place):
-                messages.append((log_time, number, data, log_time, 0))
+            for row in self._database.execute(query, (first, last)):
+                yield row
         except _ERRORS as error:
             self.note(f"is not readable to its end: {_one_line(error)}")
-        return messages
+            with suppress(*_ERRORS):  # a cursor is a row ahead, and has lost it with the error
+                yield from self._database.execute(f"{query} LIMIT 1", (row[0] + 1, last))
 
     def _out_of_steps(self) -> bool:
         self._steps -= 1
@@ -112,21 +118,24 @@ class SqliteSource(Source):
             (problem,) = self._database.execute("PRAGMA quick_check(1)").fetchone()
             if problem != "ok":
                 self.note(f"is damaged: {' '.join(problem.split())}")
-            size = _PIECE_BYTES
-            for row, number, log_time, length in self._database.execute(_ROWS.format("length(data)"), (_FIRST, _LAST)):
-                self.counts[number] += 1
-                first, start_ns, end_ns = row, log_time, log_time
-                if size < _PIECE_BYTES:
-                    start_ns, end_ns, _, (first, _) = self.pieces.pop()
-                    size += length
-                else:
-                    size = length
-                self.pieces.append(Piece(min(start_ns, log_time), max(end_ns, log_time), self, (first, row)))
             (rows,) = self._database.execute("SELECT count(*) FROM messages").fetchone()
-            if rows > self.counts.total():
-                self.note(f"{rows - self.counts.total()} row(s) hold no message of a known topic")
         except _ERRORS as error:
-            self.note(f"is not readable to its end: {_one_line(error)}")
+            self.note(f"is damaged: {_one_line(error)}")
+            rows = 0
+        size = _PIECE_BYTES
+        for row, number, log_time, length in self._rows("length(data)", _FIRST, _LAST):
+            self.counts[number] += 1
+            first, start_ns, end_ns = row if self.pieces else _FIRST, log_time, log_time
+            if size < _PIECE_BYTES:
+                start_ns, end_ns, _, (first, _) = self.pieces.pop()
+            else:
+                size = 0
+            size += length
+            self.pieces.append(Piece(min(start_ns, log_time), max(end_ns, log_time), self, (first, row)))
+        if self.pieces:  # rows that damage has put out of their order stand beyond what they say
+            self.pieces[-1] = self.pieces[-1]._replace(place=(first, _LAST))
+        if rows > self.counts.total():
+            self.note(f"{rows - self.counts.total()} row(s) hold no message of a known topic")
 
 
 def _text(cell: Any) -> str:

@@ -8,6 +8,7 @@ import random
 import shutil
 import sqlite3
 from collections.abc import Callable
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
@@ -234,6 +235,24 @@ def test_a_truncated_sqlite_bag_is_read_as_far_as_it_goes(tmp_path: Path) -> Non
         assert found == list(range(1000, 1000 + len(found)))
         assert len(found) > 1000
         assert "bag.db3: is damaged: *** in database main" in reader.damage[0]
+
+
+def test_every_row_before_damage_is_read(tmp_path: Path) -> None:
+    path = foreign.write_sqlite(tmp_path / "bag", foreign.drive(400)) / "a_0.db3"
+    with closing(sqlite3.connect(path)) as database:
+        ((page_bytes,), (pages,)) = (
+            database.execute(f"PRAGMA {name}").fetchone() for name in ("page_size", "page_count")
+        )
+    content = bytearray(path.read_bytes())
+    content[page_bytes * (pages - 4) : page_bytes * (pages - 3)] = bytes([255]) * page_bytes
+    path.write_bytes(content)
+    readable = 0
+    with closing(sqlite3.connect(path)) as database, suppress(sqlite3.DatabaseError):
+        while database.execute("SELECT data FROM messages WHERE rowid = ?", (readable + 1,)).fetchone():
+            readable += 1
+    with BagReader(path) as reader:
+        assert len(list(reader.messages())) == readable > 500
+        assert reader.damage
 
 
 def test_a_sqlite_bag_older_than_type_hashes_and_definitions(tmp_path: Path) -> None:
