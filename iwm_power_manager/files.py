@@ -138,6 +138,17 @@ def atomic_write(path: Path | str, data: bytes) -> None:
         raise ConfigError(path, "", f"cannot be written: {error.strerror or error}") from None
 
 
+def make_folder(path: Path | str, *, new: bool = False) -> Path:
+    """Create a folder with those above it; `ConfigError` if that cannot be, or if it was to be new and is there."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=not new)
+    except OSError as error:
+        allowed = f"a folder{' that is not there yet' if new else ''}"
+        raise ConfigError(path, "", f"cannot be created: {error.strerror}", allowed) from None
+    return folder
+
+
 def sync_folder(path: Path) -> None:
     """Have the disk take a folder's entries: before, a new or renamed file is not safe from a power cut.
 

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import atomic_write, read_text, sha256_of
+from iwm_power_manager.files import atomic_write, make_folder, read_text, sha256_of
 from iwm_power_manager.share import resolve
 from iwm_sim.fleet.task import COLUMNS, Batch, Given, differences, key_of
 
@@ -73,11 +73,8 @@ class Store:
         if problem:
             raise ConfigError(self.folder, "", f"was begun with something else: {problem}", "another --output")
         content = begun | {"files": begun["files"] | hashes}
-        for folder in (self.folder, self.policies, self._rows):
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise ConfigError(folder, "", f"cannot be made: {error.strerror}", "a folder") from None
+        for folder in (self.policies, self._rows):
+            make_folder(folder)
         atomic_write(path, (json.dumps(content, indent=1) + "\n").encode())
         return Given(str(self.policies.absolute()), content["fingerprint"], hashes)
 

@@ -94,7 +94,6 @@ def ablation(
     places : cycles with frictions
     quiet : no progress bar
     """
-    folder.mkdir(parents=True, exist_ok=True)
     wanted: list[Case] = []
     for cycle, friction in places:
         base = Case(cycle, policies.vehicle, "none", friction, "equal")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import PolicyError
-from iwm_power_manager.files import read_bytes
+from iwm_power_manager.files import make_folder, read_bytes
 from iwm_power_manager.kernel_cache import cache_folder, sources_hash
 from iwm_power_manager.mdp.demand import chain_of, source_of
 from iwm_power_manager.mdp.problem import load_problem
@@ -141,7 +141,7 @@ def solved(
     if not _is_whole(file):
         what = f"solving the policy on grid {grid_file.stem} for friction {friction:g}, idle_drive {vehicle.idle_drive}"
         say(f"{because}; {what}" if because else what)
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         problem = load_problem(grid_file).for_car(vehicle.params)
         if budget_per_min is not None:
             problem = dataclasses.replace(problem, changes_per_min=budget_per_min)

@@ -19,8 +19,7 @@ import numpy.typing as npt
 
 from iwm_power_manager import __version__
 from iwm_power_manager.control.settings import as_shown, default_settings
-from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import atomic_write
+from iwm_power_manager.files import atomic_write, make_folder
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.policy import Policy
 from iwm_power_manager.tools.progress import Bar
@@ -74,11 +73,8 @@ def study(
         usual ones are not among them
     """
     started = time.perf_counter()
-    try:
-        for folder in ("figures", "grids"):
-            (output / folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(output, "", f"cannot be created: {error.strerror}", "a folder") from None
+    for folder in ("figures", "grids"):
+        make_folder(output / folder)
     say = silent if quiet else tell
     policies = Policies(vehicle, policy, say)
     for name in VARIANTS:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from iwm_power_manager.control.settings import default_settings
-from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.exit_codes import DONE, FAILED
+from iwm_power_manager.files import make_folder
 from iwm_power_manager.tools import command
 from iwm_sim import metrics
 from iwm_sim.closed_loop import Run
@@ -34,7 +34,7 @@ def run(plan: Plan) -> int:
     if plan.scenario:
         return run_scenario(plan)
     loaded = load(plan)
-    _make_output(plan)
+    make_folder(make_folder(plan.output, new=True) / "log")
     vehicle = loaded.vehicle
     print(f"{vehicle.name} on {loaded.cycle.name}, friction {plan.friction:g}, idle drive {vehicle.idle_drive}")
     compile_for_a_drive()
@@ -57,7 +57,7 @@ def run_scenario(plan: Plan) -> int:
     scenario = load_scenario(plan.scenario, plan.idle_drive or None)
     plan = dataclasses.replace(plan, vehicle=str(scenario.vehicle.path), friction=scenario.assumed_friction)
     load(plan)
-    _make_output(plan)
+    make_folder(make_folder(plan.output, new=True) / "log")
     print(f"{scenario.name}: {scenario.about}")
     compile_for_a_drive()
     outcome = drive_over_dds(plan, scenario.name)
@@ -68,16 +68,6 @@ def run_scenario(plan: Plan) -> int:
     if plan.json:
         command.write_json(plan.json, result.values)
     return DONE if outcome.complete and result.passed else FAILED
-
-
-def _make_output(plan: Plan) -> None:
-    try:
-        plan.output.mkdir(parents=True)
-        (plan.output / "log").mkdir()
-    except OSError as error:
-        raise ConfigError(
-            plan.output, "", f"cannot be created: {error.strerror}", "a folder that is not there yet"
-        ) from None
 
 
 # --- the result -----------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from iwm_power_manager import __version__
 from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import atomic_write
+from iwm_power_manager.files import atomic_write, make_folder
 from iwm_power_manager.model.feasible import trace_warnings
 from iwm_power_manager.tools.command import PICTURES, made_with, write_json, write_picture
 from iwm_power_manager.tools.progress import Bar
@@ -83,7 +83,7 @@ def _doubts(wanted: Sequence[Case]) -> list[str]:
 def planned(options: argparse.Namespace) -> list[Case]:
     """The cases of a command line, each checked, with their policies found or solved. Equal split is always there."""
     if options.save_series:
-        _folder(options.save_series)
+        make_folder(options.save_series)
     strategies = list(dict.fromkeys([REFERENCE, *(options.strategy or [DEFAULT_STRATEGY])]))
     settings = _settings(options)
     result: list[tuple[str, Case]] = []
@@ -176,15 +176,6 @@ def remarks(rows: Sequence[Row]) -> list[str]:
         if told != solved_for:
             lines.append(f"friction {told:g} was driven with the policy for {solved_for:g}, the nearest there is")
     return lines
-
-
-def _folder(path: str) -> Path:
-    folder = Path(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(path, "", f"cannot be created: {error.strerror}", "a folder") from None
-    return folder
 
 
 def _only[Value](option: str, values: Sequence[Value], default: Value) -> Value:
@@ -301,7 +292,7 @@ def _scenario(options: argparse.Namespace) -> None:
 def _frontier(options: argparse.Namespace) -> None:
     if not options.cycle:
         raise ConfigError("arguments", "--cycle", "is missing", "one drive cycle or more, for instance nycc")
-    folder = _folder(options.frontier)
+    folder = make_folder(options.frontier)
     found = []
     for idle_drive in options.idle_drive or [""]:
         vehicle = cases.vehicle_of(options.vehicle, idle_drive)
@@ -325,7 +316,7 @@ def _show_frontier(made: frontier.Frontier, picture: Path) -> None:
 
 
 def _unseen(options: argparse.Namespace) -> None:
-    folder = _folder(options.unseen)
+    folder = make_folder(options.unseen)
     idle_drive = _only("--idle-drive", options.idle_drive, "")
     wanted = unseen.cells(options.vehicle, idle_drive, options.seeds, options.cycles, options.cars)
     if not wanted:

@@ -58,7 +58,7 @@ def test_policies_are_solved_alone(small_grid, tmp_path, capsys):
         (["drive", "small", "--strategy", "equal", "--grid", "fine"], "--grid: has no effect: no strategy here"),
         (["drive", "small", "--strategy", "equal", "--budget", "4"], "--budget: has no effect: no strategy here"),
         (["drive", "small", "--scheduler", "tcp://nowhere:1", "--jobs", "2"], "--jobs: has no effect"),
-        (["drive", *CAR, "--cycle", "nycc", "--friction", "0.9", "--output", "/proc/no/study"], "cannot be made"),
+        (["drive", *CAR, "--cycle", "nycc", "--friction", "0.9", "--output", "/proc/no/study"], "cannot be created"),
     ],
 )
 def test_a_mistake_ends_in_one_line(arguments, words, tmp_path, capsys):
