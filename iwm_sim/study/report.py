@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 import html
 import io
+import itertools
 import json
 import math
 import re
@@ -27,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from iwm_power_manager import __version__
 from iwm_power_manager.files import atomic_write
+from iwm_power_manager.tools.command import plain
 from iwm_sim.study.palette import COLOURS, INK
 
 if TYPE_CHECKING:
@@ -122,13 +124,10 @@ class Table[R]:
     @property
     def groups(self) -> list[tuple[str, int]]:
         """Headings above the columns with the number of columns each spans; empty without any."""
-        spans: list[tuple[str, int]] = []
-        for column in self.columns:
-            if column.group and spans and spans[-1][0] == column.group:
-                spans[-1] = (column.group, spans[-1][1] + 1)
-            else:
-                spans.append((column.group, 1))
-        return spans if any(name for name, _ in spans) else []
+        if not any(column.group for column in self.columns):
+            return []
+        spans = [list(found) for _, found in itertools.groupby(self.columns, lambda column: column.group or id(column))]
+        return [(found[0].group, len(found)) for found in spans]
 
 
 @dataclass(frozen=True)
@@ -188,10 +187,10 @@ class Chart:
             lines = []
             for series in panel.series:
                 thin_time, values = thin(time, np.asarray(series.values, dtype=np.float64), CHART_POINTS)
-                lines.append(vars(series) | {"values": _compact(values)})
+                lines.append(vars(series) | {"values": values})
             panels.append(vars(panel) | {"series": lines})
-        content = {"time": _compact(thin_time, 8), "panels": panels}
-        return json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+        content = {"time": plain(thin_time, 8), "panels": plain(panels, 7)}
+        return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
 
 
 @dataclass(frozen=True)
@@ -359,18 +358,6 @@ def svg_of(figure: Figure, prefix: str, title: str) -> str:
 def _page_font(font: str) -> str:
     size = re.search(r"([\d.]+)px", font)
     return f"font: {size.group(1) if size else '10'}px system-ui, sans-serif"
-
-
-def _compact(values: NDArray[np.float64], digits: int = 7) -> list[float | int | None]:
-    """Numbers of `digits` significant digits, whole ones as integers, NaN as null."""
-    numbers: list[float | int | None] = []
-    for value in values.tolist():
-        if not math.isfinite(value):
-            numbers.append(None)
-            continue
-        short = float(f"{value:.{digits}g}")
-        numbers.append(int(short) if short.is_integer() and abs(short) < 1e15 else short)
-    return numbers
 
 
 def _is_number(value: Any) -> bool:
