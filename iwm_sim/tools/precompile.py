@@ -5,14 +5,13 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from iwm_power_manager.command_line import CommandParser
-from iwm_power_manager.errors import IwmError
+from iwm_power_manager.tools.command import ended, write_json
 
 #: What the work needs, but `--help` does not.
 NEEDS = (
@@ -121,30 +120,28 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compile everything; returns the exit code."""
     options = parser().parse_args(arguments)
-    from iwm_power_manager import compilation, kernel_cache
-    from iwm_power_manager.tools.progress import Bar, show_compiling
+    return ended("precompile", lambda: _compile(options), quiet=options.quiet)
 
-    show_compiling(quiet=options.quiet)
-    try:
-        work = list(jobs())
-        with Bar(len(work), "parts", "compiling", quiet=options.quiet) as bar:
-            for name, job in work:
-                bar.set_postfix_str(name)
-                job()
-                bar.update()
-    except IwmError as error:
-        print(f"precompile: error: {error}", file=sys.stderr)
-        return error.exit_code
+
+def _compile(options: argparse.Namespace) -> None:
+    from iwm_power_manager import compilation, kernel_cache
+    from iwm_power_manager.tools.progress import Bar
+
+    work = list(jobs())
+    with Bar(len(work), "parts", "compiling", quiet=options.quiet) as bar:
+        for name, job in work:
+            bar.set_postfix_str(name)
+            job()
+            bar.update()
     kernel_cache.prune(UNUSED_FOR_S)
     if options.json:
-        print(json.dumps([use._asdict() for use in compilation.USES], indent=2))
+        write_json("-", compilation.USES)
     else:
         new = [use for use in compilation.USES if not use.found]
         print(
             f"{len(compilation.USES)} entry points are ready, {len(new)} of them compiled now "
             f"({sum(use.seconds for use in new):.0f} s)"
         )
-    return 0
 
 
 if __name__ == "__main__":
