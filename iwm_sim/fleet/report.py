@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from iwm_power_manager.errors import ConfigError
@@ -38,7 +37,6 @@ from iwm_sim.study.report import (
 )
 from iwm_sim.study.tables import plain_table
 
-FloatArray = npt.NDArray[np.float64]
 Rows = list[dict[str, Any]]
 
 #: Places in the list of the worst, and cars and cycles in the table before it shows only the extremes.

@@ -81,7 +81,7 @@ class Case:
     rule : coefficients of strategy `rule`
     switching_cost_j, switching_fixed_cost_j : of strategy `preview`
     changes_per_min : of strategy `preview`: a budget of changes, whose price is found; 0 takes the prices
-    dt_s, substeps : control step, plant steps in it
+    dt_s : control step
     soc : at the start
     assumed_friction : what the law is told; None is the truth
     policies : folder or file of policies over friction; with it, the law is told the friction it has estimated
@@ -104,7 +104,6 @@ class Case:
     switching_fixed_cost_j: float = 0.0
     changes_per_min: float = 0.0
     dt_s: float = 0.01
-    substeps: int = 1
     soc: float = 0.8
     assumed_friction: float | None = None
     policies: str = ""
@@ -227,7 +226,6 @@ def _driven(
         case.friction,
         assumed_friction=case.assumed_friction,
         dt_s=case.dt_s,
-        substeps=case.substeps,
         soc=case.soc,
         until_s=until_s,
         **others,

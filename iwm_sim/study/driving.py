@@ -52,7 +52,7 @@ def with_rules(wanted: Sequence[Case], jobs: int) -> list[Case]:
 def _rule_key(case: Case) -> tuple[Any, ...] | None:
     if case.strategy != "rule":
         return None
-    return case.vehicle, case.idle_drive, case.car, case.law_friction, case.dt_s, case.substeps, case.soc
+    return case.vehicle, case.idle_drive, case.car, case.law_friction, case.dt_s, case.soc
 
 
 def drive_all(
@@ -70,8 +70,8 @@ def drive_all(
 
 
 def seconds_of(case: Case) -> float:
-    """About how long a processor needs for a case: plant steps, times what its strategy takes beside equal split."""
-    steps = _duration_s(case.cycle) / case.dt_s * case.substeps
+    """About how long a processor needs for a case: steps, times what its strategy takes beside equal split."""
+    steps = _duration_s(case.cycle) / case.dt_s
     return _SECONDS_PER_STEP * steps * _WEIGHTS.get(case.strategy, _OTHER_WEIGHT)
 
 

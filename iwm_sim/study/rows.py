@@ -144,7 +144,7 @@ def _possible(bound: Result, others: Sequence[Result], reference: Metrics | None
 
 def _group(case: Case) -> tuple[Any, ...]:
     return (
-        *(case.cycle, case.vehicle, case.idle_drive, case.friction, case.dt_s, case.substeps, case.soc),
+        *(case.cycle, case.vehicle, case.idle_drive, case.friction, case.dt_s, case.soc),
         *(case.assumed_friction, case.noise, case.car, case.plant),
     )
 

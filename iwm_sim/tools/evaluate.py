@@ -164,7 +164,6 @@ def _add_simulation(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--dt", type=number(1e-4, MAX_DT_S), default=0.01, metavar="S", help="control step (default: %(default)s)"
     )
-    group.add_argument("--substeps", type=whole(1, 100), default=1, metavar="N", help="plant steps in it")
     group.add_argument(
         "--initial-soc",
         type=number(0.05, 1.0),

@@ -98,7 +98,6 @@ def planned(options: argparse.Namespace) -> list[Case]:
             strategy=REFERENCE,
             settings=settings,
             dt_s=options.dt,
-            substeps=options.substeps,
             soc=options.initial_soc,
             assumed_friction=options.assumed_friction,
             noise=SensorNoise(options.noise[0], options.noise[1], options.seed),
