@@ -216,16 +216,22 @@ class SignalMapping(NamedTuple):
         Raises
         ------
         ConfigError
-            A name is none, one topic has two names, or a command goes where something else comes from or goes to.
+            A name is none, one topic has two names, two wheels are one number, or a command goes where something else
+            comes from or goes to.
         """
         taken = dict.fromkeys(_OF_ROS, "is ROS's own") | dict.fromkeys(own, "is this node's own")
         inputs: dict[str, Source] = {}
-        for source in (source for sources in self.sources.values() for source in sources):
+        numbers: dict[tuple[str, str, str], Source] = {}
+        for signal, source in ((signal, source) for signal, sources in self.sources.items() for source in sources):
             full = self._resolved(source, resolve, taken)
             first = inputs.setdefault(full, source)
             if first.topic != source.topic:
                 problem = f"{source.topic} is {full}, and so is {first.topic} of {first.key}"
                 raise ConfigError(self.path, f"{source.key}.topic", problem, "the same name for the same topic")
+            wheel = numbers.setdefault((signal, full, source.field), source)
+            if wheel is not source:
+                problem = f"{source.field} of {full} is another wheel's as well ({wheel.key})"
+                raise ConfigError(self.path, f"{source.key}.field", problem, "a number of its own for each wheel")
         taken |= {full: f"is an input as well ({source.key})" for full, source in inputs.items()}
         for sink in (sink for sinks in self.commands.values() for sink in sinks):
             taken[self._resolved(sink, resolve, taken)] = f"carries a command as well ({sink.key})"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -93,6 +94,40 @@ def test_a_topic_without_slash_is_found_in_its_namespace_unless_there_are_two() 
     assert topic_named("speed", ["/overspeed"]) is None
     with pytest.raises(BagError, match="recorded in several namespaces: /a/speed, /b/speed"):
         topic_named("speed", ["/b/speed", "/a/speed"])
+
+
+@pytest.mark.parametrize(
+    ("entries", "problem"),
+    [
+        (
+            "signals: {wheel_speed: [fl, fr, fl, rr]}",
+            "signals.wheel_speed[2].field: data of fl is another wheel's as well (signals.wheel_speed[0]); allowed: a",
+        ),
+        (
+            "signals: {motor_torque: [fl, fr, rl, rl]}",
+            "signals.motor_torque[3].field: data of rl is another wheel's as well (signals.motor_torque[2])",
+        ),
+        (
+            "signals: {}\ncommands: {friction_torque: none, motor_torque: [fl, fl, rl, rr]}",
+            "commands.motor_torque[1].topic: fl carries a command as well (commands.motor_torque[0])",
+        ),
+    ],
+)
+def test_one_number_for_two_wheels_is_refused_with_both(tmp_path: Path, entries: str, problem: str) -> None:
+    text = entries
+    for wheel in ("fl", "fr", "rl", "rr"):
+        unit = "rpm" if "wheel_speed" in entries else "N m"
+        text = re.sub(rf"\b{wheel}\b", f"{{topic: {wheel}, type: std_msgs/Float64, field: data, unit: {unit}}}", text)
+    with pytest.raises(ConfigError) as caught:
+        load_mapping(mapping_file(tmp_path, text))
+    assert problem in str(caught.value)
+
+
+def test_two_wheels_may_have_places_of_one_list_and_two_signals_one_number(tmp_path: Path) -> None:
+    wheels = ", ".join(f"{{topic: w, field: 'data[{i}]', unit: rpm}}" for i in range(4))
+    pedals = ", ".join(f"{p}_pedal: {{topic: axis, field: data, unit: '1'}}" for p in ("accelerator", "brake"))
+    mapping = load_mapping(mapping_file(tmp_path, f"signals: {{wheel_speed: [{wheels}], {pedals}}}"))
+    assert mapping.topics() == ["w", "axis"]
 
 
 @pytest.mark.parametrize(
