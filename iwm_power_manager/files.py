@@ -58,10 +58,18 @@ def _blocks(path: Path | str) -> Iterator[bytes]:
             while block := file.read(_BLOCK):
                 yield block
     except OSError as error:
-        near = share.did_you_mean(Path(path)) if isinstance(error, FileNotFoundError) else ""
+        near = share.did_you_mean(Path(path)) or _from(path) if isinstance(error, FileNotFoundError) else ""
         raise ConfigError(path, "", f"cannot be read: {error.strerror or error}{near}") from None
     except ValueError as error:  # a null character in the path
         raise ConfigError(path, "", f"cannot be read: {error}") from None
+
+
+def _from(path: Path | str) -> str:
+    """Where a relative path begins: a file that names others, and a service, may be read from another folder."""
+    try:
+        return "" if os.path.isabs(path) else f" (looked for from {os.getcwd()})"
+    except OSError:  # the folder is gone
+        return ""
 
 
 def read_bytes(path: Path | str, limit: int = MAX_FILE_BYTES) -> bytes:
@@ -82,7 +90,9 @@ def read_text(path: Path | str, limit: int = MAX_TEXT_BYTES) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ConfigError(path, "", f"is not UTF-8 text (byte {error.start})") from None
+        raise ConfigError(
+            path, "", f"is not UTF-8 text (byte {error.start}): save it as UTF-8, or iconv -f latin1 -t utf-8"
+        ) from None
 
 
 def sha256_of(path: Path | str) -> str:

@@ -17,6 +17,8 @@ from iwm_power_manager import errors
 from iwm_power_manager.errors import ConfigError
 
 PACKAGE = "iwm_power_manager"
+#: Folders that an installation has, too: what else lies in a checkout is somebody's own.
+_SHIPPED = ("config", "launch", "policies")
 
 
 def roots() -> list[Path]:
@@ -66,7 +68,7 @@ def resolve(path: Path | str) -> Path:
     if given.is_absolute() or (there and not os.path.isdir(given)):
         return given
     for root in roots():
-        if os.path.exists(root / given) and not there:
+        if given.parts[:1] and given.parts[0] in _SHIPPED and os.path.exists(root / given) and not there:
             return root / given
         matches = _files_named(root, str(given)) if len(given.parts) == 1 else []
         if len(matches) > 1 and not there:

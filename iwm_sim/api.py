@@ -134,7 +134,7 @@ def load_cycle_file(name: str) -> Cycle:
 
 def drive(
     cycle: str | Cycle,
-    car: Vehicle,
+    car: str | Vehicle,
     friction: float,
     policy: Policy | None = None,
     strategy: str = "",
@@ -147,7 +147,7 @@ def drive(
     Parameters
     ----------
     cycle : file, short name, or a loaded cycle
-    car : what is driven
+    car : file, short name, or a loaded car
     friction : peak friction coefficient of the road
     policy : of this car; with one, the strategy is the default one
     strategy : one of `control.strategies.drivable()`; "" is `sdp_lookahead` with a policy and `equal` without
@@ -167,6 +167,7 @@ def drive(
     name = strategy or (DEFAULT_STRATEGY if policy else "equal")
     _check(name, policy, rule, settings or default_settings(), {"friction": friction, **options})
     loaded = load_cycle_file(cycle) if isinstance(cycle, str) else cycle
+    car = load_car(car) if isinstance(car, str) else car
     if policy is not None:
         policy.check_vehicle(car)
     law = (settings or default_settings())._replace(strategy=STRATEGIES[name].code)

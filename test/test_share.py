@@ -17,6 +17,19 @@ def test_a_file_of_the_package_is_found_from_any_folder(tmp_path: Path, monkeypa
     assert share.resolve("config/cycles/nycc.csv").is_file()
 
 
+@pytest.mark.parametrize("name", ["README.md", "examples/your_car/my_car.yaml", "runs/mine.csv"])
+def test_nothing_else_of_a_checkout_stands_in_for_a_file_that_is_missing(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkout, work = tmp_path / "checkout", tmp_path / "work"
+    work.mkdir()
+    (checkout / name).parent.mkdir(parents=True)
+    (checkout / name).touch()
+    monkeypatch.setattr(share, "roots", lambda: [checkout])
+    monkeypatch.chdir(work)
+    assert share.resolve(name) == Path(name)
+
+
 def test_the_users_own_file_goes_before_that_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own = tmp_path / "config" / "cycles" / "nycc.csv"
     own.parent.mkdir(parents=True)

@@ -35,7 +35,7 @@ from iwm_power_manager.bags.metadata import (
     typed,
 )
 from iwm_power_manager.bags.sqlite_source import SqliteSource
-from iwm_power_manager.errors import BagError, system_errors
+from iwm_power_manager.errors import BagError, did_you_mean, system_errors
 
 SUFFIXES = (".mcap", ".db3")
 COMPRESSED_SUFFIXES = (".zstd", ".lz4")
@@ -224,7 +224,9 @@ class BagReader(ExitStack):
             except BagError as error:
                 problems.append(str(error))
         if not self.sources:
-            raise BagError(problems[0] if problems else f"{self.path}: holds no .mcap or .db3 file")
+            inside = {path.parent for kind in (".mcap", ".db3") for path in self.path.glob(f"*/*{kind}")}
+            meant = did_you_mean(str(path) for path in sorted(inside)[:3])
+            raise BagError(problems[0] if problems else f"{self.path}: holds no .mcap or .db3 file{meant}")
         self.sources.sort(key=lambda source: _recording_order(source.path))
         self._damage += problems
 

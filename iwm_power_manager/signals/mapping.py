@@ -278,7 +278,7 @@ def _source(file: Path, key: str, signal: str, entry: Any, *, wheels: bool = Fal
     optional = ["type", "factor", "offset", "sign", "qos", "stamp", *(["names"] if wheels else [])]
     values = check_keys(file, entry, ["topic", "field", "unit"], optional, key)
     units = UNITS[signal]
-    unit = check_choice(file, dotted(key, "unit"), values["unit"], units)
+    unit = check_choice(file, dotted(key, "unit"), str(values["unit"]), units)  # YAML's 1 is a number
     sign = signs(file, dotted(key, "sign"), values.get("sign", 1), wheels=wheels)
     factor = check_factor(file, dotted(key, "factor"), values.get("factor", 1.0))
     offset = check_number(file, dotted(key, "offset"), values.get("offset", 0.0), -_OFFSET, _OFFSET)

@@ -85,7 +85,9 @@ def _replay(bag: BagReader, options: argparse.Namespace) -> int:
             lines.append("  the policy is not the one that was recorded: its file or folder has another SHA-256")
         lines += _comparison_lines(report)
     code = DONE
-    if options.compare and exceeds(report.comparison, options.tolerance):
+    if options.compare and not any(topic.compared for topic in report.comparison):
+        code = CANNOT_TELL
+    elif options.compare and exceeds(report.comparison, options.tolerance):
         code = CANNOT_TELL if report.gaps and not report.changed else FAILED
         if code == CANNOT_TELL:
             lines.append(

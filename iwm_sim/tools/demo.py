@@ -126,7 +126,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return run(plan)
     except KeyboardInterrupt:
-        kept = f"; what was recorded stays in {plan.output}" if plan.output.is_dir() else ""
+        what = "what was recorded" if (plan.output / "bag").is_dir() else "the log"
+        kept = f"; {what} stays in {plan.output}" if plan.output.is_dir() else ""
         print(f"\ndemo: stopped; all processes have ended{kept}", file=sys.stderr)
         return INTERRUPTED
     except IwmError as error:

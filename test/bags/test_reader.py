@@ -321,6 +321,12 @@ def test_a_bag_that_is_not_there_is_answered_with_the_names_near_it(tmp_path: Pa
         BagReader(tmp_path / "drive_1")
 
 
+def test_a_folder_of_bags_is_answered_with_the_bags_in_it(make_bag: Callable[..., Path]) -> None:
+    path = make_bag([("/a", 1, 1.0)])
+    with pytest.raises(BagError, match=rf"holds no \.mcap or \.db3 file; did you mean {path}\?$"):
+        BagReader(path.parent)
+
+
 def test_a_folder_above_a_bag_that_is_not_there_is_answered_with_the_names_near_it(tmp_path: Path) -> None:
     (tmp_path / "drive" / "bag").mkdir(parents=True)
     (tmp_path / "drives").mkdir()

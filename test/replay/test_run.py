@@ -373,6 +373,19 @@ def test_a_command_topic_that_carries_another_type_is_not_compared(
     assert f"not compared: /bms: {mapping}: {carries}" in line
 
 
+def test_a_bag_with_nothing_to_compare_cannot_tell(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagReader(drive) as source, BagWriter(tmp_path / "inputs") as bag:
+        ours = ("/wheel_torque_command", "/friction_brake_command", "/power_manager/state")
+        numbers = {name: bag.add_topic(topic) for name, topic in source.topics.items() if name not in ours}
+        for message in source.messages():
+            if message.topic in numbers:
+                bag.write(numbers[message.topic], message.log_time_ns, message.data)
+    assert main([str(tmp_path / "inputs"), "--compare"]) == CANNOT_TELL
+    assert "nothing to compare" in capsys.readouterr().out
+
+
 def copied(drive: Path, path: Path, names: dict[str, str], *more: Topic) -> None:
     """The same bag with other names of topics, and a message of `more` topics, each of a state."""
     with BagReader(drive) as source, BagWriter(path) as bag:

@@ -87,6 +87,12 @@ def test_wheels_get_other_names_only_where_they_are_found_by_name(tmp_path: Path
     assert load_mapping(path).with_wheel_names(names).sources["wheel_speed"][0].names == ()
 
 
+def test_the_unit_one_may_be_a_number(tmp_path: Path) -> None:
+    text = "signals: {accelerator_pedal: {topic: x, field: data, unit: %s}}"
+    one, quoted = (load_mapping(mapping_file(tmp_path, text % unit)).sources for unit in ("1", "'1'"))
+    assert one == quoted
+
+
 def test_a_topic_without_slash_is_found_in_its_namespace_unless_there_are_two() -> None:
     assert topic_named("speed", ["/car/speed", "/other"]) == "/car/speed"
     assert topic_named("/car/speed", ["/car/speed"]) == "/car/speed"

@@ -99,6 +99,11 @@ def test_what_cannot_be_driven_is_refused_in_one_line(car, what, said):
     assert "\n" not in str(error.value)
 
 
+def test_a_car_may_be_named(car):
+    named, loaded = (api.drive("nycc", which, 0.9, until_s=20.0) for which in ("jalalmaab_2015", car))
+    assert named.metrics == loaded.metrics
+
+
 def test_a_rule_drives_by_its_coefficients(car):
     front = api.drive("nycc", car, 0.9, strategy="rule", rule=(0.0, 1.0, 0.0, 1.0), until_s=60.0)
     equal = api.drive("nycc", car, 0.9, strategy="equal", until_s=60.0)

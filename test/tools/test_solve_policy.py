@@ -325,5 +325,6 @@ def test_as_a_process_it_teaches_and_exits_with_its_codes(tmp_path):
     assert "exit codes:" in taught.stdout
     missing = call("--vehicle", "none.yaml", "--cycle", "nycc", "--friction", "0.5", "--output", "x")
     assert missing.returncode == 2
-    assert missing.stderr == "solve_policy: error: none.yaml: cannot be read: No such file or directory\n"
+    gone = f"none.yaml: cannot be read: No such file or directory (looked for from {tmp_path})"
+    assert missing.stderr == f"solve_policy: error: {gone}\n"
     assert call("--cycle", "nycc").returncode == 2
