@@ -10,7 +10,7 @@ from rclpy.node import Node
 from iwm_power_manager.nodes.power_manager_inputs import Inputs
 from iwm_power_manager.nodes.power_manager_outputs import Outputs
 from iwm_power_manager.ros import diagnostics
-from iwm_power_manager.ros.matching import mismatched_publishers, mismatched_subscribers
+from iwm_power_manager.ros.matching import mismatched_publishers, mismatched_subscribers, node_name
 
 #: Nodes that hear commands and obey none: this package's own, rosbag2's, and those of the command `ros2`.
 _WATCHERS, _COMMAND_LINE = ("recorder", "watch_car", "rosbag2_recorder"), "_ros2cli"
@@ -38,7 +38,7 @@ def look(node: Node, inputs: Inputs, outputs: Outputs, slow: dict[str, str]) -> 
     types = inputs.types | outputs.types
     commanders = {topic: node.count_publishers(topic) for topic in map(node.resolve_topic_name, outputs.topics)}
     deaf = _lines(mismatched_subscribers(node, outputs.publishers, types))
-    wrong = [*_shared(commanders), *deaf]
+    wrong = [*_shared(node, commanders), *deaf]
     obeying = {topic: _obeying(node, topic) for topic in commanders}
     unobeyed = [topic for topic, count in obeying.items() if not count]
     values = {f"{topic}: publishers": str(count) for topic, count in commanders.items()}
@@ -49,7 +49,7 @@ def look(node: Node, inputs: Inputs, outputs: Outputs, slow: dict[str, str]) -> 
     mismatches = mismatched_publishers(node, inputs.subscriptions, types, inputs.how_to_hear)
     unheard = _lines(mismatches)
     senders = {found.topic_name: node.count_publishers(found.topic_name) for found in inputs.subscriptions}
-    several = _shared(senders)
+    several = _shared(node, senders)
     heard_badly = [*unheard, *several, *_lines(slow)]
     if heard_badly:
         level = diagnostics.ERROR if unheard else diagnostics.WARN
@@ -81,13 +81,13 @@ def _lines(reasons: dict[str, str]) -> list[str]:
     return [f"{', '.join(found)}: {why}" for why, found in topics.items()]
 
 
-def _shared(publishers: dict[str, int]) -> list[str]:
-    """A line for all topics that have the same number of publishers, which is more than one."""
-    by_count: dict[int, list[str]] = {}
-    for topic, count in publishers.items():
-        by_count.setdefault(count, []).append(topic)
+def _shared(node: Node, publishers: dict[str, int]) -> list[str]:
+    """A line for all topics that have the same publishers, more than one; a node that publishes twice stands there twice."""
+    found: dict[str, list[str]] = {}
+    for topic in (topic for topic, count in publishers.items() if count > 1):
+        names = ", ".join(sorted(map(node_name, node.get_publishers_info_by_topic(topic))))
+        found.setdefault(f"{publishers[topic]} publishers{{}}: {names}", []).append(topic)
     return [
-        f"{', '.join(topics)} " + (f"have {count} publishers each" if len(topics) > 1 else f"has {count} publishers")
-        for count, topics in by_count.items()
-        if count > 1
+        f"{', '.join(topics)} " + ("have " + words.format(" each") if len(topics) > 1 else "has " + words.format(""))
+        for words, topics in found.items()
     ]

@@ -30,9 +30,9 @@ def mismatched_publishers(
             for info in node.get_publishers_info_by_topic(topic):
                 sent = info.topic_type
                 if sent != msgtypes[topic]:
-                    lines.append(f"{_name(info)} sends {sent}, not {msgtypes[topic]}{remedy(topic, sent)}")
+                    lines.append(f"{node_name(info)} sends {sent}, not {msgtypes[topic]}{remedy(topic, sent)}")
                 elif reason := _misfit(info.qos_profile, subscription.qos_profile):
-                    lines.append(f"{_name(info)} offers another quality of service: {reason}")
+                    lines.append(f"{node_name(info)} offers another quality of service: {reason}")
             found[topic] = "; ".join(lines)
     return {topic: text for topic, text in found.items() if text}
 
@@ -46,14 +46,15 @@ def mismatched_subscribers(node: Node, publishers: Iterable[Any], msgtypes: dict
             lines = []
             for info in node.get_subscriptions_info_by_topic(topic):
                 if info.topic_type != msgtypes[topic]:
-                    lines.append(f"{_name(info)} wants {info.topic_type}, not {msgtypes[topic]}")
+                    lines.append(f"{node_name(info)} wants {info.topic_type}, not {msgtypes[topic]}")
                 elif reason := _misfit(publisher.qos_profile, info.qos_profile):
-                    lines.append(f"{_name(info)} asks for another quality of service: {reason}")
+                    lines.append(f"{node_name(info)} asks for another quality of service: {reason}")
             found[topic] = "; ".join(lines)
     return {topic: text for topic, text in found.items() if text}
 
 
-def _name(info: Any) -> str:
+def node_name(info: Any) -> str:
+    """Full name of the node an endpoint belongs to."""
     return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 

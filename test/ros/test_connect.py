@@ -204,7 +204,7 @@ def test_topics_remapped_on_the_command_line_are_the_ones_that_are_watched(conne
 
     car.stack.drive(inputs, lambda: car.stack.last("ecu/torque") and car.stack.last("ecu/torque").data > 50.0, "torque")
     name = car.stack.node.get_namespace()
-    said = f"{name}/ecu/torque has 2 publishers"
+    said = f"{name}/ecu/torque has 2 publishers: {name}/power_manager, {name}/stack"
     car.stack.drive(inputs, lambda: said in car.running.text(), "the other commander")
     assert f"{name}/ecu/torque: publishers: 2" in values(car.stack, "command topics")
 

@@ -191,7 +191,9 @@ class TestDiagnostics:
             lambda: bench.status("command topics") and bench.status("command topics").level == DiagnosticStatus.ERROR,
             "the error",
         )
-        assert "wheel_torque_command has 2 publishers" in bench.status("command topics").message
+        full = bench.node.get_fully_qualified_name()
+        both = f"{full}, {bench.node.get_namespace().rstrip('/')}/power_manager"
+        assert f"wheel_torque_command has 2 publishers: {both}" in bench.status("command topics").message
         bench.node.destroy_publisher(intruder)
         bench.drive(lambda: bench.status("command topics").level == DiagnosticStatus.OK, "quiet again")
 
@@ -199,7 +201,9 @@ class TestDiagnostics:
         kind = messages.TOPIC_TYPES[messages.POWER_DEMAND]
         intruder = bench.node.create_publisher(kind, messages.POWER_DEMAND, qos.profile(lockstep=False))
         found = bench.drive(lambda: bench.status("input topics"), "the warning")
-        assert (found.level, "power_demand has 2 publishers" in found.message) == (DiagnosticStatus.WARN, True)
+        full = bench.node.get_fully_qualified_name()
+        said = f"power_demand has 2 publishers: {full}, {full}"
+        assert (found.level, said in found.message) == (DiagnosticStatus.WARN, True)
         bench.node.destroy_publisher(intruder)
 
     def test_a_publisher_with_weaker_quality_of_service_is_named(self, start_pair) -> None:

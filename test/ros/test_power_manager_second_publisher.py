@@ -104,11 +104,13 @@ def test_a_second_publisher_is_told_in_log_and_diagnostics_for_every_input(car: 
         for topic in (*inputs, messages.ROAD_FRICTION)
     ]
 
+    name = bench.node.get_fully_qualified_name()
+
     def told() -> bool:
         status = bench.status("input topics")
         return (
             status is not None
-            and status.message.endswith("have 2 publishers each")
+            and status.message.endswith(f"have 2 publishers each: {name}, {name}")
             and all(p.topic_name in status.message for p in others)
         )
 
