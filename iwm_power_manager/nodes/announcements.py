@@ -38,6 +38,19 @@ def input_topics(signals: mapping.SignalMapping) -> dict[str, tuple[str, ...]]:
     return {name: tuple(topics) for name, topics in found.items()}
 
 
+def silent_topics(
+    topics: Sequence[str], trouble: Mapping[str, str], now_ns: int, heard_ns: Mapping[str, int]
+) -> tuple[tuple[str, ...], str]:
+    """Of the topics of an input those that are missing, and what is known of why (`Announcements.stepped`).
+
+    Without a known reason they are those that are silent for more than half as long as the one silent longest.
+    """
+    ages_ns = {topic: now_ns - heard_ns.get(topic, 0) for topic in topics}
+    silent = tuple(topic for topic in topics if topic in trouble)
+    silent = silent or tuple(topic for topic, age_ns in ages_ns.items() if 2 * age_ns > max(ages_ns.values()))
+    return silent, "; ".join(dict.fromkeys(trouble[topic] for topic in silent if topic in trouble))
+
+
 class Announcements:
     """Speaks on a node's logger, each thing once.
 
@@ -211,8 +224,7 @@ class Announcements:
             came = stale == ~0 and tally.accepted_ns is not None and not trouble.keys() & found
             if came or not stale & bit:
                 continue
-            silent = tuple(topic for topic in found if topic in trouble) or self._silent(found, now_ns)
-            reason = "; ".join(dict.fromkeys(trouble[topic] for topic in silent if topic in trouble))
+            silent, reason = silent_topics(found, trouble, now_ns, self._heard_ns)
             if not reason and tally.why():
                 reason = f"{tally.in_a_row[tally.violation]} messages refused, {tally.why()}"
                 found = () if name == DEMAND and tally.described() else found  # which says on what topic
@@ -222,11 +234,6 @@ class Announcements:
             where = ", ".join(topic for topic in found and (silent or found) if topic != name)
             parts.append(f"{name}" + (f" on {where}" if where else "") + (f" ({reason})" if reason else ""))
         return ", ".join(parts)
-
-    def _silent(self, topics: Sequence[str], now_ns: int) -> tuple[str, ...]:
-        """Of several topics those that are missing: silent for more than half as long as the one silent longest."""
-        ages_ns = {topic: now_ns - self._heard_ns.get(topic, 0) for topic in topics}
-        return tuple(topic for topic, age_ns in ages_ns.items() if 2 * age_ns > max(ages_ns.values()))
 
     def _due(self, what: str, every_s: float = REPEAT_S) -> bool:
         now = time.monotonic()

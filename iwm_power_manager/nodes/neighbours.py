@@ -82,7 +82,7 @@ def _lines(reasons: dict[str, str]) -> list[str]:
 
 
 def _shared(node: Node, publishers: dict[str, int]) -> list[str]:
-    """A line for all topics that have the same publishers, more than one; a node that publishes twice stands there twice."""
+    """A line for all topics that have the same publishers, more than one; a node that has two is named twice."""
     found: dict[str, list[str]] = {}
     for topic in (topic for topic, count in publishers.items() if count > 1):
         names = ", ".join(sorted(map(node_name, node.get_publishers_info_by_topic(topic))))

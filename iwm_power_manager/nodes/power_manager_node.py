@@ -25,7 +25,7 @@ from iwm_power_manager.control.stepping import HELD_UP, Lockstep, RealTime, Take
 from iwm_power_manager.errors import IwmError, one_line
 from iwm_power_manager.nodes import neighbours, pace
 from iwm_power_manager.nodes import power_manager_config as config
-from iwm_power_manager.nodes.announcements import Announcements, input_topics
+from iwm_power_manager.nodes.announcements import Announcements, input_topics, silent_topics
 from iwm_power_manager.nodes.demand_log import DemandLog
 from iwm_power_manager.nodes.policy_choice import Policies
 from iwm_power_manager.nodes.power_manager_inputs import Inputs
@@ -438,9 +438,10 @@ class PowerManager(Starting):
     def _publish_report(self) -> None:
         self._report_due = False
         now_ns = self._now_ns()
-        message = self._report.message(
-            now_ns, self.lifecycle_state(), self._controller, self._values, self.own_statuses()
-        )
+        extra = self.own_statuses()
+        heard_ns = self._inputs.heard_ns if self._inputs else {}
+        silent = {name: silent_topics(found, self._unheard, now_ns, heard_ns) for name, found in self._topics.items()}
+        message = self._report.message(now_ns, self.lifecycle_state(), self._controller, self._values, extra, silent)
         self._diagnostics.publish(message)
         if self._demand_log:
             self._demand_log.write_if_due()

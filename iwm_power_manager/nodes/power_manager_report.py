@@ -116,6 +116,7 @@ class PowerManagerReport:
         controller: Controller | None,
         values: Mapping[str, Any],
         extra: Sequence[diagnostics.Status],
+        silent: Mapping[str, tuple[Sequence[str], str]],
     ) -> DiagnosticArray:
         """State of the node since the last call.
 
@@ -126,6 +127,7 @@ class PowerManagerReport:
         controller : None while the node is not configured
         values : the node's parameters
         extra : statuses of the node's own, as of the policy
+        silent : of each input the topics that are missing if it is, and what is known of why
         """
         statuses: list[diagnostics.Status] = []
         command = controller.command if controller else None
@@ -156,6 +158,7 @@ class PowerManagerReport:
                     controller.supervision.stale,
                     controller.monitor.verdicts,
                     self._wheel_names,
+                    silent,
                 )
             )
             self._apart = (self._apart or controller.monitor.apart) if self._doubted else ""  # the same words, as above

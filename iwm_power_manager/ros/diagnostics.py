@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from iwm_power_manager.control.actuators import ActuatorState, MotorVerdict
 from iwm_power_manager.control.inputs import Violation, WheelVerdict
-from iwm_power_manager.control.monitor import Tally
+from iwm_power_manager.control.monitor import DEMAND, Tally
 from iwm_power_manager.control.supervision import MODE_NAMES, MODE_NORMAL, STALE_NAMES, Supervision, binding_limits
 from iwm_power_manager.control.types import GATE_NAMES, Wheels
 from iwm_power_manager.ros.messages import ns_to_stamp
@@ -131,8 +131,9 @@ class InputReport:
         stale: int,
         verdicts: Sequence[WheelVerdict],
         wheel_names: Sequence[str],
+        silent: Mapping[str, tuple[Sequence[str], str]],
     ) -> Status:
-        """Ages, rates, counters and reasons of all inputs."""
+        """Ages, rates, counters and reasons of all inputs; `silent` has the topics of one that is missing, and why."""
         problems: list[tuple[int, str]] = []
         values = {}
         elapsed_s = 0.0 if self._last_ns is None else (now_ns - self._last_ns) / 1e9
@@ -148,7 +149,7 @@ class InputReport:
             for reason, count in sorted(tally.dropped.items()):
                 values[f"{topic}: dropped, {_words(reason)}"] = str(count)
             if topic in missing:
-                problems.append((ERROR, f"{topic} is missing" + (f" ({tally.why()})" if tally.why() else "")))
+                problems.append((ERROR, _missing(topic, tally, *silent.get(topic, ((), "")))))
             elif dropped > self._dropped.get(topic, 0):
                 problems.append((WARN, f"{topic}: {tally.why() or 'dropped'}"))
             self._received[topic], self._dropped[topic] = tally.received, dropped
@@ -159,6 +160,14 @@ class InputReport:
         self._last_ns = now_ns
         level, message = _worst(problems)
         return Status("inputs", level, message, values)
+
+
+def _missing(name: str, tally: Tally, topics: Sequence[str], reason: str) -> str:
+    """That an input is missing, on which of its topics where its name is none of them, and why."""
+    described = name == DEMAND and tally.described()  # which names the topic
+    where = ", ".join(topic for topic in topics if not described and not topic.endswith(f"/{name}"))
+    why = tally.why() or reason
+    return f"{name} is missing" + (f" on {where}" if where else "") + (f" ({why})" if why else "")
 
 
 def control_status(

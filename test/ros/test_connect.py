@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +124,9 @@ def test_a_car_with_odometry_pedals_and_foreign_joints_drives_and_brakes(connect
         car.stack.drive(
             without(silent), lambda: torque_nm(last("wheel_torque_command")) == 0.0, f"no torque without {silent}"
         )
+        words = f"power_demand is missing on {car.stack.node.get_namespace()}/{silent}"
+        named = partial(says, car.stack, "inputs", words)
+        car.stack.drive(without(silent), named, "its topic in diagnostics")
         car.stack.drive(inputs, drives, "driving torque again")
     brake = 50.0
     car.stack.drive(
@@ -343,6 +347,12 @@ def test_a_drive_on_mapped_topics_is_recorded_without_naming_them_and_its_comman
         line.split() for line in capsys.readouterr().out.splitlines() if line.startswith(("  recorded ", "  equal "))
     ]
     assert [float(row[4]) for row in rows] == [0.0, 0.0], "no friction brakes"
+
+
+def says(stack: Stack, name: str, words: str) -> bool:
+    """Whether a status of the last diagnostics has these words."""
+    statuses = stack.diagnostics[-1].status if stack.diagnostics else []
+    return any(words in status.message for status in statuses if status.name.endswith(f": {name}"))
 
 
 def values(stack: Stack, name: str) -> str:

@@ -99,10 +99,10 @@ class TestInputs:
 
     def test_rates_are_counted_between_reports(self) -> None:
         tallies, report = self.tallies(), InputReport()
-        report.report(0, tallies, 0, GOOD, WHEELS)
+        report.report(0, tallies, 0, GOOD, WHEELS, {})
         for i in range(50):
             tallies["vehicle_speed"].note(Violation.NONE, i)
-        status = report.report(SECOND // 2, tallies, 0, GOOD, WHEELS)
+        status = report.report(SECOND // 2, tallies, 0, GOOD, WHEELS, {})
         assert status.values["vehicle_speed: rate (Hz)"] == "100.0"
         assert status.values["power_demand: rate (Hz)"] == "0.0"
         assert status.values["power_demand: age (s)"] == "inf"
@@ -111,27 +111,40 @@ class TestInputs:
     def test_a_missing_input_is_an_error_with_its_reason(self) -> None:
         tallies = self.tallies()
         tallies["vehicle_speed"].note(Violation.STAMP_TOO_OLD, 0)
-        status = InputReport().report(0, tallies, STALE_SPEED | STALE_DEMAND, GOOD, WHEELS)
+        status = InputReport().report(0, tallies, STALE_SPEED | STALE_DEMAND, GOOD, WHEELS, {})
         assert status.level == ERROR
         assert status.message == "vehicle_speed is missing (stamp too old); power_demand is missing"
+
+    def test_of_a_missing_input_the_silent_topic_is_named_where_its_own_name_is_another(self) -> None:
+        silent = {"vehicle_speed": (["/car/vehicle_speed"], ""), "power_demand": (["/pedals/brake"], "no publisher")}
+        status = InputReport().report(0, self.tallies(), STALE_SPEED | STALE_DEMAND, GOOD, WHEELS, silent)
+        assert status.message == "vehicle_speed is missing; power_demand is missing on /pedals/brake (no publisher)"
+
+    def test_a_refused_demand_that_names_its_topic_is_told_without_the_others(self) -> None:
+        tallies = self.tallies()
+        tallies["power_demand"].describe = lambda: "brake_pedal on /brake: 250 %"
+        tallies["power_demand"].note(Violation.OUT_OF_RANGE, 0)
+        silent = {"power_demand": (["/accelerator", "/brake"], "")}
+        message = InputReport().report(0, tallies, STALE_DEMAND, GOOD, WHEELS, silent).message
+        assert message == "power_demand is missing (out of range: brake_pedal on /brake: 250 %)"
 
     def test_a_dropped_message_is_a_warning_once(self) -> None:
         tallies, report = self.tallies(), InputReport()
         tallies["vehicle_speed"].note(Violation.NOT_FINITE, 0)
-        first = report.report(0, tallies, 0, GOOD, WHEELS)
+        first = report.report(0, tallies, 0, GOOD, WHEELS, {})
         assert (first.level, first.message) == (WARN, "vehicle_speed: not finite")
         assert first.values["vehicle_speed: dropped, not finite"] == "1"
-        assert report.report(SECOND, tallies, 0, GOOD, WHEELS).level == OK
+        assert report.report(SECOND, tallies, 0, GOOD, WHEELS, {}).level == OK
 
     def test_a_message_dropped_before_a_good_one_is_still_told(self) -> None:
         tallies = self.tallies()
         tallies["vehicle_speed"].note(Violation.NOT_FINITE, 0)
         tallies["vehicle_speed"].note(Violation.NONE, 0)
-        assert InputReport().report(0, tallies, 0, GOOD, WHEELS).message == "vehicle_speed: dropped"
+        assert InputReport().report(0, tallies, 0, GOOD, WHEELS, {}).message == "vehicle_speed: dropped"
 
     def test_a_lost_wheel_is_a_warning(self) -> None:
         verdicts = (WheelVerdict.GOOD, WheelVerdict.STUCK, WheelVerdict.GOOD, WheelVerdict.GOOD)
-        status = InputReport().report(0, self.tallies(), 0, verdicts, WHEELS)
+        status = InputReport().report(0, self.tallies(), 0, verdicts, WHEELS, {})
         assert (status.level, status.message) == (WARN, "wheel front_right is not believed (stuck)")
         assert status.values["wheel front_right"] == "stuck"
 
@@ -270,5 +283,5 @@ def test_an_input_that_does_not_come_is_missing_and_not_doubted(stale, named):
     )
     for _ in range(5):
         report.note_step(command, controller.supervision, 0.0, 0.01, 1e-4)
-    report.message(0, "active", controller, LIMITS | {"strategy": "equal"}, [])
+    report.message(0, "active", controller, LIMITS | {"strategy": "equal"}, [], {})
     assert [line.partition(" not believed")[0] for line in report.doubts] == ([named] if named else [])
