@@ -53,6 +53,8 @@ _NO_TORQUE: Wheels = (0.0, 0.0, 0.0, 0.0)
 #: Partners must have been seen for this long: the other side learns of a match a little later than this one.
 _SETTLE_S = 0.3
 _POLL_S = 0.05
+#: What it waits for is told this often.
+_TELL_S = 5.0
 _PROGRESS_S = 0.2
 _LAST_WORDS_S = 5.0
 #: How often, and how far apart, the other command is looked for once one is there; later the timer looks.
@@ -196,7 +198,7 @@ class Simulator(Node):
             self._intake.subscribe(JointState, m.FRICTION_BRAKE_COMMAND, profile)
         # Wall time in every mode: this node is where simulated time comes from.
         self._wall = Clock(clock_type=ClockType.STEADY_TIME)
-        self._start_s = time.monotonic()
+        self._start_s = self._told_s = time.monotonic()
         self._timer = self.create_timer(_POLL_S, self._look_for_partners, clock=self._wall)
         self.get_logger().info(f"{self._drive.description}; waiting for the power manager")
 
@@ -225,10 +227,12 @@ class Simulator(Node):
         missing = self._missing_partners()
         if missing:
             self._partners_since_s = math.inf
+            words = f"there is still no {'; no '.join(missing)}"
             if now - self._start_s >= self._partner_timeout_s:
-                self._fail(
-                    NoAnswerError(f"after {self._partner_timeout_s:g} s there is still no {'; no '.join(missing)}")
-                )
+                self._fail(NoAnswerError(f"after {self._partner_timeout_s:g} s {words}"))
+            elif now - self._told_s >= _TELL_S:
+                self._told_s = now
+                self.get_logger().info(f"waits: {words}")
             return
         if math.isinf(self._partners_since_s):
             self._partners_since_s = now

@@ -234,6 +234,17 @@ def test_with_a_recorder_expected_it_waits_for_its_word(stand_in) -> None:
     assert last.endswith("no word from the recorder that it is ready")
 
 
+def test_what_it_waits_for_is_told_before_it_gives_up(stand_in) -> None:
+    """A power manager that takes the demand from pedals does not subscribe to `power_demand`."""
+    pair = stand_in(lockstep=False, rate_hz=50.0, until_s=0.2)
+    demand = next(one for one in pair.node.subscriptions if one.topic_name.endswith(m.POWER_DEMAND))
+    assert pair.node.destroy_subscription(demand)
+    waits = f"waits: there is still no subscription of {pair.namespace}/{m.POWER_DEMAND}\n"
+    Bench.spin_until(pair, lambda: waits in pair.running.text(), "what it misses")
+    pair.node.create_subscription(m.TOPIC_TYPES[m.POWER_DEMAND], m.POWER_DEMAND, lambda _: None, 1)
+    assert pair.finish() == 0
+
+
 # --- real time ------------------------------------------------------------------------------------------------------
 
 
