@@ -23,13 +23,26 @@ _FEW_STEPS = 5
 _ASKED_W, _ASKED_N, _NONE, _MOSTLY = 1e3, 500.0, 0.05, 0.9
 #: Slower, a car may roll back on a slope; and what it gains in a second against its motors then.
 _ROLLS_MPS, _GAINS_MPS = 1.5, 0.2
+#: A car that its motors drive has moved off when it is faster than this, and does so sooner than in this time.
+_MOVES_MPS, _MOVES_OFF_NS = 0.1, 2_000_000_000
+
+
+def _in_earnest(command: Command, motor_factor: float, asked_w: float) -> bool:
+    """Whether power to drive is asked for, and no input is missing."""
+    return motor_factor == 1.0 and asked_w > min(_ASKED_W, _ASKED_N * max(abs(command.speed_mps), 1.0))
 
 
 def is_cut(command: Command, motor_factor: float, asked_w: float) -> bool:
     """Whether power to drive is asked for and as good as none is given, although no input is missing."""
     given_w = command.front_power_w + command.rear_power_w
-    earnest_w = min(_ASKED_W, _ASKED_N * max(abs(command.speed_mps), 1.0))
-    return motor_factor == 1.0 and asked_w > earnest_w and abs(given_w) < _NONE * asked_w
+    return _in_earnest(command, motor_factor, asked_w) and abs(given_w) < _NONE * asked_w
+
+
+def is_stuck(command: Command, motor_factor: float, asked_w: float) -> bool:
+    """Whether a car stands, or rolls back slowly, although its motors are commanded what is asked for."""
+    along_mps = command.speed_mps if sum(command.motor_torque_nm) > 0.0 else -command.speed_mps
+    given = _in_earnest(command, motor_factor, asked_w) and not is_cut(command, motor_factor, asked_w)
+    return given and -_ROLLS_MPS <= along_mps < _MOVES_MPS
 
 
 def is_against(command: Command, asked_w: float) -> bool:
@@ -43,6 +56,16 @@ def against_in_words(command: Command) -> str:
     return (
         f"goes faster and faster, {command.speed_mps:.3g} m/s, against {sum(command.motor_torque_nm):.3g} N m of its "
         "motors: right sign of the motor_torque command, of speed and wheel_speed?"
+    )
+
+
+def stuck_in_words(command: Command) -> str:
+    """What keeps a car from moving off."""
+    held = ", its own brakes hold it" if any(command.friction_torque_nm) else ""
+    motors_nm = sum(command.motor_torque_nm)
+    return (
+        f"does not move off, {command.speed_mps:.2g} m/s at {motors_nm:.3g} N m of its motors{held}: "
+        "right sign of the motor_torque command? A brake that is on, too steep a slope?"
     )
 
 
@@ -87,9 +110,10 @@ class PowerManagerReport:
         self._activity: Counter[str] = Counter()
         self._steps = 0
         self._doubted: Counter[int] = Counter()
-        self._cut_steps = self._against_steps = 0
+        self._cut_steps = self._against_steps = self._stuck_steps = 0
         self._from_mps = 0.0
-        self._cut = self._apart = self._against = ""
+        self._stuck_since_ns: int | None = None
+        self._cut = self._apart = self._against = self._stuck = ""
         self.doubts: list[str] = []
 
     def note_step(
@@ -103,6 +127,7 @@ class PowerManagerReport:
         self._steps += 1
         self._against_steps += is_against(command, asked_w)
         self._cut_steps += is_cut(command, supervision.motor_factor, asked_w)
+        self._stuck_steps += is_stuck(command, supervision.motor_factor, asked_w)
         self._doubted.update(number for number in range(5) if doubted & 1 << number)
         if command.gate != GATE_NONE:
             self._activity["gate"] += 1
@@ -131,13 +156,8 @@ class PowerManagerReport:
         """
         statuses: list[diagnostics.Status] = []
         command = controller.command if controller else None
-        if controller and self._steps >= _FEW_STEPS:  # the same words as long as it lasts
-            self._cut = (self._cut or cut_in_words(controller)) if self._cut_steps > _MOSTLY * self._steps else ""
-        if command and self._steps >= _FEW_STEPS:
-            gained = abs(command.speed_mps) > abs(self._from_mps) + _GAINS_MPS
-            against = self._against_steps > _MOSTLY * self._steps and (gained or bool(self._against))
-            self._against = (self._against or against_in_words(command)) if against else ""
-            self._from_mps = command.speed_mps
+        if controller and command and self._steps >= _FEW_STEPS:
+            self._judge_drive(now_ns, controller, command)
         statuses.append(
             diagnostics.control_status(
                 lifecycle,
@@ -147,7 +167,7 @@ class PowerManagerReport:
                 self._activity,
                 values["strategy"],
                 self._car,
-                self._cut or self._against,
+                self._cut or self._against or self._stuck,
             )
         )
         if lifecycle == "active" and controller:
@@ -168,15 +188,30 @@ class PowerManagerReport:
             )
             if self._steps >= _FEW_STEPS:
                 self.doubts = [sensors.message] if sensors.level != diagnostics.OK else []
-                self.doubts += [words for words in (self._cut, self._against) if words]
+                self.doubts += [words for words in (self._cut, self._against, self._stuck) if words]
             statuses.append(sensors)
             statuses.append(diagnostics.motors_status(controller.actuators, self._wheel_names))
             statuses.append(diagnostics.brakes_status(controller.brake_gain, self._wheel_names))
             statuses.append(self._loop.report(self._rate_hz, values))
         self._activity.clear()
         self._doubted.clear()
-        self._steps = self._cut_steps = self._against_steps = 0
+        self._steps = self._cut_steps = self._against_steps = self._stuck_steps = 0
         return diagnostics.to_message(now_ns, self._node_name, [*statuses, *extra])
+
+    def _judge_drive(self, now_ns: int, controller: Controller, command: Command) -> None:
+        """Whether the car does what its motors are asked for; the same words as long as it lasts."""
+        most = _MOSTLY * self._steps
+        self._cut = (self._cut or cut_in_words(controller)) if self._cut_steps > most else ""
+        gained = abs(command.speed_mps) > abs(self._from_mps) + _GAINS_MPS
+        against = self._against_steps > most and (gained or bool(self._against))
+        self._against = (self._against or against_in_words(command)) if against else ""
+        self._from_mps = command.speed_mps
+        if self._stuck_steps <= most:
+            self._stuck_since_ns, self._stuck = None, ""
+        elif self._stuck_since_ns is None:
+            self._stuck_since_ns = now_ns
+        elif now_ns - self._stuck_since_ns >= _MOVES_OFF_NS:
+            self._stuck = self._stuck or stuck_in_words(command)
 
 
 class ChangeDetector:

@@ -22,7 +22,13 @@ from iwm_power_manager.control.supervision import (
     STALE_WHEELS,
     Supervision,
 )
-from iwm_power_manager.nodes.power_manager_report import ChangeDetector, PowerManagerReport, is_against, is_cut
+from iwm_power_manager.nodes.power_manager_report import (
+    ChangeDetector,
+    PowerManagerReport,
+    is_against,
+    is_cut,
+    is_stuck,
+)
 from iwm_power_manager.ros.diagnostics import (
     ERROR,
     OK,
@@ -265,6 +271,28 @@ def test_near_standstill_a_force_is_asked_for_and_the_power_is_small(speed_mps, 
 def test_a_car_that_moves_against_motors_that_drive_it(speed_mps, motor_nm, asked_w, against):
     command = command_of((0.0,) * len(DECIDED_NAMES))._replace(speed_mps=speed_mps, motor_torque_nm=(motor_nm,) * 4)
     assert is_against(command, asked_w) is against
+
+
+@pytest.mark.parametrize(
+    ("speed_mps", "motor_nm", "given_w", "motor_factor", "asked_w", "stuck"),
+    [
+        (0.0, 220.0, 2600.0, 1.0, 2600.0, True),
+        (-0.1, 220.0, 2600.0, 1.0, 2600.0, True),  # held by its own brakes again and again
+        (0.1, -220.0, 2600.0, 1.0, 2600.0, True),  # in reverse
+        (0.2, 220.0, 2600.0, 1.0, 2600.0, False),  # moves off
+        (-0.2, -220.0, 2600.0, 1.0, 2600.0, False),
+        (-2.0, 220.0, 2600.0, 1.0, 2600.0, False),  # goes against its motors, which is another fault
+        (0.0, 220.0, 2600.0, 0.9, 2600.0, False),  # an input is missing
+        (0.0, 30.0, 400.0, 1.0, 400.0, False),  # creeps at most
+        (0.0, 0.0, 0.0, 1.0, 2600.0, False),  # a limit leaves nothing
+        (0.0, 0.0, -2600.0, 1.0, -2600.0, False),  # brakes
+    ],
+)
+def test_a_car_that_is_to_drive_off_and_does_not(speed_mps, motor_nm, given_w, motor_factor, asked_w, stuck):
+    command = command_of((0.0,) * len(DECIDED_NAMES))._replace(
+        speed_mps=speed_mps, motor_torque_nm=(motor_nm,) * 4, front_power_w=0.5 * given_w, rear_power_w=0.5 * given_w
+    )
+    assert is_stuck(command, motor_factor, asked_w) is stuck
 
 
 @pytest.mark.parametrize(

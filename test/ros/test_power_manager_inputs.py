@@ -322,6 +322,21 @@ def test_a_car_that_goes_faster_and_faster_against_its_motors_is_told(start_own,
     assert any(said in status.message for array in bench.diagnostics for status in array.status) is told
 
 
+def test_a_car_that_its_own_brakes_hold_against_its_motors_is_told(start_own) -> None:
+    """Motors that turn the other way push it back, its hold brakes stop it: it would stand so for ever."""
+    pair = start_own({"missed_periods": 10, "own_gap_s": 1.0})
+    bench = pair.bench
+    bench.connect()
+    bench.drive(lambda: bench.mode() == 1, "normal operation", speed=0.0, demand=0.0)
+    bench.drive(lambda: min(bench.frictions[-1].effort) < -100.0, "the hold", speed=-0.1, demand=3000.0)
+    said = ": right sign of the motor_torque command? A brake that is on"
+    bench.drive(lambda: "WARN" in said_with(pair, said), "the reason", speed=-0.1, demand=3000.0)
+    assert "does not move off, -0.1 m/s at " in said_with(pair, said)
+    assert "N m of its motors, its own brakes hold it: " in said_with(pair, said)
+    bench.drive(lambda: said in bench.status("control").message, "and in the diagnostics", speed=-0.1, demand=3000.0)
+    bench.drive(lambda: "over: " in said_with(pair, said), "that it is over", speed=2.0, demand=3000.0)
+
+
 def said_with(pair, text: str) -> str:
     """Lines of the node's log with that text."""
     return "\n".join(line for line in pair.running.text().splitlines() if text in line)
