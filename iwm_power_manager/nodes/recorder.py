@@ -8,6 +8,7 @@ Three threads share the work: this module's main loop takes messages from DDS (`
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import sys
 import time
@@ -69,6 +70,8 @@ _MEBIBYTE = 1024 * 1024
 _STATUS_PERIOD_S = 1.0
 _DISCOVERY_FAST_S = 0.05
 _DISCOVERY_SLOW_S = 0.25
+#: After this time it says which topics it waits for.
+_TELL_S = 5.0
 #: The publisher learns of the match a little after the subscription does.
 _SETTLE_S = 0.5
 #: What a power cut may cost; a disk that takes longer is reported.
@@ -86,12 +89,16 @@ PARAMETERS = (
     _spec("output", "", "Folder of the bag to create; empty: rosbag2_<date and time> in the working directory."),
     _spec("topics", DEFAULT_TOPICS, "Topics to record; relative names honour namespace and remaps."),
     _spec("regex", "", "Regular expression; every topic whose full name matches it is recorded, too."),
-    _spec("signals_file", DEFAULT_MAPPING, "Signals YAML of the car: every topic it names is recorded, too."),
+    _spec(
+        "signals_file",
+        DEFAULT_MAPPING,
+        "Signals YAML of the car: every topic it names is recorded, too; '': none but those of topics and regex.",
+    ),
     _spec(
         "wait_for",
         [""],
         "Topics that must be matched before ~/ready says true; '': those of speed, wheels, demand and commands in the "
-        "signals file, and power_manager/state.",
+        "signals file, and power_manager/state; without a signals file those of topics.",
     ),
     _spec("record", True, "Begin to record at once; false: wait for ~/start."),
     _spec("compression", "zstd", "Compression of the chunks.", choices=COMPRESSIONS),
@@ -127,12 +134,9 @@ class Recorder(Node):
         super().__init__("recorder")
         self._leave_clock_to_the_recording()
         values = declare(self, PARAMETERS)
-        mapping = load_mapping(resolve(values["signals_file"]))
-        mapping.check_topics(self.resolve_topic_name)
-        commands = [sink.topic for sinks in mapping.commands.values() for sink in sinks]
-        sources = [source.topic for signal in _LOOP for source in mapping.sources.get(signal, ())]
-        wait_for = list(filter(None, values["wait_for"])) or [*sources, *commands, POWER_MANAGER_STATE]
-        self._wait_for = self._in_full("wait_for", wait_for)
+        topics = list(filter(None, values["topics"]))
+        of_car, loop = self._of_car(values["signals_file"]) if values["signals_file"] else ([], topics)
+        self._wait_for = self._in_full("wait_for", list(filter(None, values["wait_for"])) or loop)
         self._poll_s = values["poll_period_s"]
         self._exit_on_error = values["exit_on_error"]
         self._remote_parameters = RemoteParameters(self) if values["node_parameters"] else None
@@ -141,7 +145,7 @@ class Recorder(Node):
         self._held: list[Taken] = []
         self._raw = RawSubscriptions(
             self,
-            self._in_full("topics", filter(None, (*values["topics"], *mapping.topics(), *commands))),
+            self._in_full("topics", (*topics, *of_car)),
             _pattern(values["regex"]),
             values["depth"],
             _learn,
@@ -166,7 +170,16 @@ class Recorder(Node):
         self.create_timer(_STATUS_PERIOD_S, self._publish_status, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._ready = False
         self._matched_since: float | None = None
+        self._waits_since = time.monotonic()
         self._ready_publisher.publish(Bool(data=False))
+
+    def _of_car(self, signals_file: str) -> tuple[list[str], list[str]]:
+        """Topics that a signals file names, and those without which a closed loop cannot run."""
+        mapping = load_mapping(resolve(signals_file))
+        mapping.check_topics(self.resolve_topic_name)
+        commands = [sink.topic for sinks in mapping.commands.values() for sink in sinks]
+        sources = [source.topic for signal in _LOOP for source in mapping.sources.get(signal, ())]
+        return [*mapping.topics(), *commands], [*sources, *commands, POWER_MANAGER_STATE]
 
     def _in_full(self, parameter: str, names: Iterable[str]) -> list[str]:
         """Full names of topics."""
@@ -238,13 +251,18 @@ class Recorder(Node):
         self._update_ready(now)
 
     def _update_ready(self, now: float) -> None:
-        if not self._raw.matched(self._wait_for):
+        missing = self._raw.unmatched(self._wait_for)
+        if missing and now - self._waits_since >= _TELL_S:
+            self._waits_since = math.inf
+            self.get_logger().info(f"not ready, no publisher of {', '.join(missing)}; it records what comes")
+        if missing:
             self._matched_since = None
         elif self._matched_since is None:
             self._matched_since = now
         ready = self._matched_since is not None and now - self._matched_since >= _SETTLE_S
         if ready != self._ready:
             self._ready = ready
+            self._waits_since = now
             self._ready_publisher.publish(Bool(data=ready))
             self.get_logger().info("ready" if ready else "a topic has lost its publisher")
 
@@ -388,6 +406,8 @@ examples:
     recorder --ros-args -p output:=drive_01 -p signals_file:=my_signals.yaml
   Two more of the car's own topics, in a new file every ten minutes:
     recorder --ros-args -p output:=drive_01 -p regex:='/imu|/gps/.*' -p max_duration_s:=600.0
+  My own topics alone:
+    recorder --ros-args -p output:=drive_01 -p "signals_file:=''" -p "topics:=[/imu, /gps/fix]"
   What a power cut left:
     recorder --recover drive_01
 

@@ -134,13 +134,13 @@ class RawSubscriptions:
                     problems.append(str(error))
         return found, problems
 
-    def matched(self, names: Iterable[str]) -> bool:
-        """Whether each of these topics is subscribed and its publisher is matched."""
-        for name in names:
-            topic = self._topics.get(name)
-            if topic is None or topic.subscription.get_publisher_count() == 0:
-                return False
-        return True
+    def unmatched(self, names: Iterable[str]) -> list[str]:
+        """Those of these topics that are not subscribed, or have no publisher that is matched."""
+        return [
+            name
+            for name in names
+            if name not in self._topics or not self._topics[name].subscription.get_publisher_count()
+        ]
 
     def take(self) -> list[Taken]:
         """All messages that have arrived, in the order of arrival."""

@@ -158,6 +158,26 @@ def test_every_message_is_recorded_byte_by_byte_and_a_signal_ends_it_cleanly(
         assert list(last.velocity) == [199.0, 0.5]
 
 
+def test_without_a_signals_file_it_records_the_topics_it_is_given_alone_and_says_what_it_waits_for(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    speed = peer.node.create_publisher(TwistStamped, "/vehicle_speed", RELIABLE)
+    numbers = peer.node.create_publisher(Float64, "/numbers", RELIABLE)
+    process = recorder(tmp_path / "bag", "signals_file:=''", "topics:=[/numbers,/late]")
+    assert process.process.stderr is not None
+    while "not ready, no publisher of /late; it records what comes" not in process.process.stderr.readline():
+        assert process.process.poll() is None
+    late = peer.node.create_publisher(Float64, "/late", RELIABLE)
+    peer.until_ready()
+    speed.publish(TwistStamped())
+    for publisher in (numbers, late):
+        publisher.publish(Float64(data=1.0))
+        assert publisher.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+    code, error = process.end()
+    assert code == 0, error
+    assert set(recorded(tmp_path / "bag")) == {"/numbers", "/late"}
+
+
 def test_default_topics_honour_namespace_and_remaps_and_metadata_tells_files_and_parameters(
     tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
 ) -> None:
