@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -17,29 +16,24 @@ several: Any = {"action": "extend", "nargs": "+", "default": []}
 
 def number(low: float, high: float) -> Callable[[str], float]:
     """Argument type of a number in a range."""
-
-    def parsed(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"'{text}' is no number; allowed: {low:g} to {high:g}") from None
-        if not (math.isfinite(value) and low <= value <= high):
-            raise argparse.ArgumentTypeError(f"{text} is out of range; allowed: {low:g} to {high:g}")
-        return value
-
-    return parsed
+    return _in_range(float, "number", low, high)
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
     """Argument type of an integer in a range."""
+    return _in_range(int, "integer", low, high)
 
-    def parsed(text: str) -> int:
+
+def _in_range[N: (int, float)](kind: Callable[[str], N], name: str, low: N, high: N) -> Callable[[str], N]:
+    allowed = f"allowed: {low:.10g} to {high:.10g}"
+
+    def parsed(text: str) -> N:
         try:
-            value = int(text)
+            value = kind(text)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"'{text}' is no integer; allowed: {low} to {high}") from None
+            raise argparse.ArgumentTypeError(f"'{text}' is no {name}; {allowed}") from None
         if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text} is out of range; allowed: {low} to {high}")
+            raise argparse.ArgumentTypeError(f"{text} is out of range; {allowed}")
         return value
 
     return parsed

@@ -184,7 +184,7 @@ def _solve_into(options: argparse.Namespace) -> int:
     solved = []
     for friction, path in zip(frictions, paths, strict=True):
         with _Progress(f"friction {friction:g}", problem.tolerance_j, options.quiet) as progress:
-            solved.append(solve_one(problem, vehicle, friction, chain, sources, path, progress.update, options.verify))
+            solved.append(solve_one(problem, vehicle, friction, chain, sources, path, progress.show, options.verify))
         say(_convergence_text(solved[-1]))
     if options.export_mdp:
         priced = solved[0].policy.problem  # with the price of a change that was found
@@ -241,31 +241,23 @@ def _sources(options: argparse.Namespace, cycles: Sequence[Cycle], problem: Prob
     return sources + [transitions_source(path, problem.dt_s, options.bag_weight) for path in options.transitions]
 
 
-class _Progress:
+class _Progress(Bar):
     """A bar over the orders of magnitude from the first bound to the tolerance."""
 
     def __init__(self, label: str, tolerance_j: float, quiet: bool) -> None:
-        self._tolerance = tolerance_j
-        self._first = 0.0
         style = "{desc} |{bar}| {n_fmt}% [{elapsed}]{postfix}"
-        self._bar = Bar(100, "%", f"{label}: tabulating", quiet=quiet, bar_format=style)
-        self._label = label
+        super().__init__(100, "%", f"{label}: tabulating", quiet=quiet, bar_format=style)
+        self._label, self._tolerance, self._first = label, tolerance_j, 0.0
 
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def update(self, iteration: Iteration) -> None:
+    def show(self, iteration: Iteration) -> None:
         """Show one more policy."""
         bound = max(iteration.bound_j, self._tolerance)
         if self._first == 0.0:
             self._first = bound
-            self._bar.set_description_str(f"{self._label}: solving")
+            self.set_description_str(f"{self._label}: solving")
         span = math.log(self._first / self._tolerance)
-        self._bar.n = round(100.0 * (math.log(self._first / bound) / span if span > 0.0 else 1.0))
-        self._bar.set_postfix_str(f"policy {iteration.number}, bound {iteration.bound_j:.3g} J")
+        self.n = round(100.0 * (math.log(self._first / bound) / span if span > 0.0 else 1.0))
+        self.set_postfix_str(f"policy {iteration.number}, bound {iteration.bound_j:.3g} J")
 
 
 def _check(options: argparse.Namespace) -> int:
