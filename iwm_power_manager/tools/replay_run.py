@@ -10,8 +10,6 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from iwm_power_manager import __version__
@@ -20,14 +18,13 @@ from iwm_power_manager.bags.writer import BagWriter, WriterOptions
 from iwm_power_manager.control.strategies import name_of
 from iwm_power_manager.errors import BagError, ConfigError, IwmError, one_line
 from iwm_power_manager.exit_codes import CANNOT_TELL, DONE, FAILED
-from iwm_power_manager.files import atomic_write
 from iwm_power_manager.replay.commands import command_topics, commands_elsewhere
 from iwm_power_manager.replay.compare import ReplayReport
 from iwm_power_manager.replay.plan import Choice, Plan, make_plan, recorded_mapping, unknown_mapping
 from iwm_power_manager.replay.run import Replay, ReplayOutput, exceeds, report_topics
 from iwm_power_manager.replay.what_if import Consumption, what_if
 from iwm_power_manager.signals.mapping import SignalMapping
-from iwm_power_manager.tools.command import made_with
+from iwm_power_manager.tools.command import made_with, write_json
 from iwm_power_manager.tools.progress import Bar
 
 #: A mean of the steps that is so near to the period is the period.
@@ -117,7 +114,7 @@ def _what_if(bag: BagReader, options: argparse.Namespace) -> int:
     if None in savings:
         lines.append("  no saving where the motors could not give that force: the work at the wheels is another")
     lines += _remarks(report)
-    found = [{**asdict(row), "saving_percent": saving} for row, saving in zip(rows, savings, strict=True)]
+    found = [{**vars(row), "saving_percent": saving} for row, saving in zip(rows, savings, strict=True)]
     _show(lines, {"bag": str(bag.path), "rows": found, "notes": report.notes, "damage": bag.damage}, options)
     return DONE
 
@@ -201,7 +198,7 @@ def _result(bag: BagReader, plan: Plan, report: ReplayReport) -> dict[str, Any]:
         "vehicle_hash": plan.vehicle.hash,
         "policies": plan.policies.checksums,
         "other_policy": _is_other_policy(bag, plan),
-        **asdict(report),
+        **vars(report),
     }
 
 
@@ -258,13 +255,10 @@ def _comparison_lines(report: ReplayReport) -> list[str]:
 
 
 def _show(lines: list[str], result: dict[str, Any], options: argparse.Namespace) -> None:
-    text = json.dumps(result, indent=1, default=list)
-    if options.json == "-":
-        print(text)
-        return
-    print("\n".join(map(one_line, lines)))
+    if options.json != "-":
+        print("\n".join(map(one_line, lines)))
     if options.json:
-        atomic_write(Path(options.json), (text + "\n").encode())
+        write_json(options.json, result)
 
 
 @contextmanager

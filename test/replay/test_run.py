@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 import re
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from iwm_power_manager.replay.compare import TopicComparer
 from iwm_power_manager.replay.plan import Choice, make_plan, recorded_parameters
 from iwm_power_manager.replay.run import STATE, Replay, report_topics
 from iwm_power_manager.share import share_path
+from iwm_power_manager.signals.contract import WHEEL_TORQUE_COMMAND
 from iwm_power_manager.signals.readings import joint_state_reader, joint_state_writer
 from iwm_power_manager.signals.types import standard_types
 from iwm_power_manager.tools.replay import main
@@ -328,6 +330,22 @@ def test_a_change_is_told_from_a_late_start(first: int, tmp_path: Path, capsys: 
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.endswith("step(s) differ whatever the law remembered of those the recording lacks")
     assert int(last.split()[0]) > 0
+
+
+def test_json_of_a_command_that_is_no_number_can_be_read_by_any_program(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagReader(drive) as old, BagWriter(tmp_path / "spoilt", custom_data=old.custom_data) as new:
+        numbers = {topic: new.add_topic(found) for topic, found in old.topics.items()}
+        for message in old.messages():
+            spoilt = message.topic.endswith(WHEEL_TORQUE_COMMAND) and message.sequence == 20
+            data = message.data[:-8] + struct.pack("<d", math.nan) if spoilt else message.data  # its last torque
+            new.write(numbers[message.topic], message.log_time_ns, data)
+    assert main([str(tmp_path / "spoilt"), "--compare", "--json", "-"]) == FAILED
+    out = capsys.readouterr().out
+    assert "NaN" not in out and "Infinity" not in out
+    (torques,) = (entry for entry in json.loads(out)["comparison"] if entry["differing"])
+    assert (torques["largest"], torques["first"]["recorded"]) == (None, None)
 
 
 @pytest.mark.parametrize(
