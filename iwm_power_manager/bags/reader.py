@@ -14,7 +14,7 @@ import re
 import tempfile
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import lru_cache
 from itertools import accumulate, count
@@ -106,7 +106,8 @@ class BagReader(ExitStack):
         self.counts: Counter[str] = Counter()
         self.custom_data = text_values(self.information.get("custom_data"))
         self._pieces = [piece for source in self.sources for piece in source.pieces]
-        self._unpack = lru_cache(maxsize=1)(_unpacked)  # to look at the first messages is no work done twice
+        # To look at the first messages is no work done twice.
+        self._unpack: Callable[[Piece], list[ChannelMessage]] = lru_cache(1)(lambda piece: piece.source.unpack(piece))
         for source in self.sources:
             self._take(source)
         self._set_back = self._where_set_back()
@@ -244,10 +245,6 @@ class BagReader(ExitStack):
             left_out = [name for name in there if name not in known and begins_as_data(name, self.path)]
             self.notes += [f"{name}: is not in metadata.yaml and left out" for name in left_out]
         return present
-
-
-def _unpacked(piece: Piece) -> list[ChannelMessage]:
-    return piece.source.unpack(piece)
 
 
 def recovered(path: Path) -> Path:

@@ -90,10 +90,10 @@ class SqliteSource(Source):
     def _read_definitions(self) -> dict[str, tuple[str, str]]:
         """Encoding and text by type; bags older than Iron carry none."""
         try:
-            rows = self._database.execute(
-                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-            )
-            return {_text(name): (_text(encoding), _text(text)) for name, encoding, text in rows}
+            names = ("topic_type", "encoding", "encoded_message_definition")  # which some write as bytes
+            columns = ", ".join(f"coalesce(CAST({name} AS TEXT), '')" for name in names)
+            rows = self._database.execute(f"SELECT {columns} FROM message_definitions")  # noqa: S608 - constants
+            return {name: (encoding, text) for name, encoding, text in rows}
         except sqlite3.Error as error:
             self.note(f"has no readable definitions: {_one_line(error)}")
             return {}
@@ -136,11 +136,6 @@ class SqliteSource(Source):
             self.pieces[-1] = self.pieces[-1]._replace(place=(first, _LAST))
         if rows > self.counts.total():
             self.note(f"{rows - self.counts.total()} row(s) hold no message of a known topic")
-
-
-def _text(cell: Any) -> str:
-    """Text of a cell, which some write as bytes."""
-    return cell.decode(errors="replace") if isinstance(cell, bytes) else str(cell or "")
 
 
 def _one_line(error: Exception) -> str:

@@ -10,7 +10,7 @@ import itertools
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -100,7 +100,8 @@ class SignalStream:
     taken, bad : messages by topic so far: of all, and those that could not be decoded or held no number of use
     reasons : by topic, why its first message could not be decoded
     without : messages by topic and wheels they had no number for
-    problems : topics that cannot be read, a line each
+    problems : topics that cannot be read, and stamps that are not used, a line each
+    by_stamp : times are the stamps of the headers, where there are any; else those of the log
     """
 
     def __init__(
@@ -111,7 +112,7 @@ class SignalStream:
         self.reasons: dict[str, str] = {}
         self.without: Counter[str] = Counter()
         self.problems: list[str] = []
-        self._by_stamp = True
+        self.by_stamp = True
         self._bag = bag
         held: dict[str, str] = {}
         types: dict[str, Types] = {}
@@ -152,23 +153,20 @@ class SignalStream:
         """Bad messages of all topics."""
         return self.bad.total()
 
-    def probe(self) -> list[tuple[str, Recorded]]:
-        """Topics and readings of the bag's first messages, which do not count."""
-        messages = itertools.islice(self._bag.messages(), _PROBE_MESSAGES)
-        found = [(message.topic, value) for message in messages for value in self.values(message)]
+    def probe(self) -> list[Recorded]:
+        """Readings of the first messages, which do not count; if their stamps do not advance, log times are used."""
+        values, stamps = [], dict[str, list[tuple[int, int]]]()
+        for message in itertools.islice(self._bag.messages(), _PROBE_MESSAGES):
+            for value in self.values(message):
+                values.append(value)
+                if value.stamped:
+                    stamps.setdefault(message.topic, []).append((value.reading.stamp_ns, value.log_time_ns))
         for counts in (self.taken, self.bad, self.without):
             counts.clear()
-        return found
-
-    def use_log_times(self, probe: Iterable[tuple[str, Recorded]]) -> str:
-        """Use log times from here on, if the header stamps of a probe do not advance; the line that says so, or ""."""
-        stamps: dict[str, list[tuple[int, int]]] = {}
-        for topic, value in probe:
-            if value.stamped:
-                stamps.setdefault(topic, []).append((value.reading.stamp_ns, value.log_time_ns))
-        standing = sorted(topic for topic, found in stamps.items() if len(found) > 2 and not _advance(found))
-        self._by_stamp = not standing
-        return f"the header stamps of {', '.join(standing)} do not advance: log times are used" if standing else ""
+        if standing := sorted(topic for topic, found in stamps.items() if len(found) > 2 and not _advance(found)):
+            self.by_stamp = False
+            self.problems.append(f"the header stamps of {', '.join(standing)} do not advance: log times are used")
+        return values
 
     @property
     def topics(self) -> set[str]:
@@ -202,7 +200,7 @@ class SignalStream:
                 where = dict.fromkeys(self._topic_of.get(name, topic) for name in missing)
                 self.without[f"{', '.join(where)}: {', '.join(missing)}"] += 1
         stamped = reader.stamped
-        if stamped and not self._by_stamp:
+        if stamped and not self.by_stamp:
             stamped = False
             found = tuple(reading._replace(stamp_ns=log_time_ns) for reading in found)
         return [Recorded(log_time_ns, publish_time_ns, stamped, reading) for reading in found]
@@ -276,7 +274,7 @@ def read_signal(
     with BagReader(bag) as reader:
         stream = SignalStream(reader, mapping, vehicle, ("speed", *DEMANDS, *PEDALS))
         check_signals(reader, mapping, stream)
-        standing = stream.use_log_times(stream.probe())
+        stream.probe()
         for log_time_ns, _, stamped, reading in stream:
             if isinstance(reading, SpeedReading) and _possible(reading.speed_mps, believed.speed):
                 speed = reading.speed_mps
@@ -285,7 +283,7 @@ def read_signal(
                 rows += [] if math.isnan(speed) else [(log_time_ns, stamp, reading.power_w, speed)]
             else:
                 wrong += isinstance(reading, SpeedReading | readings.DemandReading)
-        damage = [*reader.notes, *reader.damage, *stream.problems, *filter(None, [standing])]
+        damage = [*reader.notes, *reader.damage, *stream.problems]
     if not rows:
         raise BagError(f"{bag}: holds no power demand with a speed before it")
     log_times, stamps, demands, speeds = map(np.array, zip(*rows, strict=True))

@@ -268,9 +268,8 @@ class ReconstructedSteps:
         self._stream = stream = SignalStream(bag, plan.mapping, plan.vehicle.params)
         check_signals(bag, plan.mapping, stream, wheels=True)
         probe = stream.probe()
-        standing = stream.use_log_times(probe)
-        report.notes += [*stream.problems, *filter(None, [standing])]
-        self._in_sets = not standing and _in_sets([value for _, value in probe[:_PROBE_VALUES]])
+        report.notes += stream.problems
+        self._in_sets = stream.by_stamp and _in_sets(probe[:_PROBE_VALUES])
         self._wheels = self._again = 0  # wheel speeds, and those of them with the stamp of the one before
         self._wheels_ns = -1
         self._came_ns: dict[str, int] = {}  # of each kind of input, by the log
