@@ -147,6 +147,13 @@ def test_a_wheel_that_shows_a_slip_it_does_not_have_takes_its_neighbours_no_brak
     it_brakes(speed_mps, power_w, 0.9, (broken,))
 
 
+@pytest.mark.parametrize("friction", [0.2, 0.5, 0.9])
+def test_a_speed_that_is_a_little_too_high_takes_no_brakes_for_good_at_the_limit(friction):
+    """Slower, it looks like slip, until the torque is gone and the wheels do not come back: that lasted to the end."""
+    broken = (wrong("vehicle_speed", "offset", 0.5, 0.0),)
+    assert check_scenario(braking(12.0, 40e3, friction, broken)).values["least_braking"] >= 0.6
+
+
 @pytest.mark.parametrize("offset_mps", [-0.5, -0.2, 0.2, 0.3, 0.5])
 @pytest.mark.parametrize("driven_w", [6e3, 12e3])
 def test_a_speed_that_is_a_little_off_from_standstill_on_takes_no_brakes(offset_mps, driven_w):
