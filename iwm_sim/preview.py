@@ -13,9 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from iwm_power_manager.control.strategies.instantaneous import PRICE_OF_MISSING
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.jit import kernel, parallel_kernel
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
+from iwm_sim.closed_loop import Run
 from iwm_sim.metrics import share_changes
 
 FloatArray = npt.NDArray[np.float64]
@@ -135,6 +137,29 @@ def cheapest_within(cost_j: FloatArray, share: FloatArray, most_changes: float) 
         else:
             high = price
     return cheapest_schedule(cost_j, share, high)
+
+
+def schedule(
+    run: Run,
+    period_s: float,
+    vehicle: VehicleParams,
+    friction: float,
+    changes_per_min: float | None = None,
+    prices_j: tuple[float, float] = (0.0, 0.0),
+) -> FloatArray:
+    """The cheapest share of each decision for the demand that a run had.
+
+    Parameters
+    ----------
+    run, period_s : a drive of the cycle, and how often the share is decided
+    vehicle, friction : what is driven, and on what
+    changes_per_min : at most so many; None is as many as are worth `prices_j`, those of `cheapest_schedule`
+    """
+    share = empty_table().share
+    cost = step_costs(run["power_demand_w"], run["speed_mps"], run.dt_s, period_s, vehicle, friction, share)
+    if changes_per_min is None:
+        return cheapest_schedule(cost, share, *prices_j)
+    return cheapest_within(cost, share, changes_per_min * run.series.shape[0] * run.dt_s / 60.0)
 
 
 def fit_rule(power_w: FloatArray, front_share: FloatArray, least_power_w: float = 200.0) -> FloatArray:

@@ -25,7 +25,6 @@ from scipy.optimize import minimize, minimize_scalar
 
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.model.parameters import Battery
 from iwm_power_manager.vehicle import Vehicle, nominal_voltage_v, with_params
 from iwm_sim import closed_loop
 from iwm_sim.study import cases
@@ -130,7 +129,11 @@ def fit(
     nominal_v = nominal_voltage_v(battery)
 
     def estimate(resistance_ohm: float, voltage_v: float) -> Estimate:
-        squares = {name: _squared_errors(run, resistance_ohm, voltage_v, battery) for name, run in runs.items()}
+        circuit = (resistance_ohm, voltage_v, battery.capacity_ah)
+        squares = {
+            name: (soc_of_model(run["electrical_power_w"], run.dt_s, *circuit, run["soc"][0]) - run["soc"]) ** 2
+            for name, run in runs.items()
+        }
         return Estimate(
             float(resistance_ohm),
             float(voltage_v),
@@ -166,15 +169,6 @@ def fit(
         comparison=_comparison(driven[0], next(iter(runs.values())), plant, car),
         idle_drive=car.idle_drive,
     )
-
-
-def _squared_errors(run: closed_loop.Run, resistance_ohm: float, voltage_v: float, battery: Battery) -> FloatArray:
-    soc = run["soc"]
-    model = soc_of_model(
-        run["electrical_power_w"], run.dt_s, resistance_ohm, voltage_v, battery.capacity_ah, float(soc[0])
-    )
-    error: FloatArray = (model - soc) ** 2
-    return error
 
 
 def _comparison(case: Case, plant: closed_loop.Run, circuit: Estimate, car: Vehicle) -> Comparison:

@@ -254,20 +254,9 @@ def known_in_advance(case: Case, vehicle: Vehicle, until_s: float = np.inf) -> t
     """A drive of the cycle with equal split, and the best schedule for the demand it had (`preview`)."""
     law = case.settings._replace(strategy=STRATEGIES[REFERENCE].code)
     equal = _driven(case, vehicle, law, empty_table(), until_s)
-    share = empty_table().share
-    cost = preview.step_costs(
-        equal["power_demand_w"],
-        equal["speed_mps"],
-        case.dt_s,
-        case.settings.decision_period_s,
-        vehicle.params,
-        case.law_friction,
-        share,
-    )
-    if case.changes_per_min > 0.0:
-        most = case.changes_per_min * equal.series.shape[0] * equal.dt_s / 60.0
-        return equal, preview.cheapest_within(cost, share, most)
-    return equal, preview.cheapest_schedule(cost, share, case.switching_cost_j, case.switching_fixed_cost_j)
+    prices_j = (case.switching_cost_j, case.switching_fixed_cost_j)
+    drive = (equal, case.settings.decision_period_s, vehicle.params, case.law_friction)
+    return equal, preview.schedule(*drive, case.changes_per_min or None, prices_j)
 
 
 def priced_as(case: Case, policy: str) -> Case:

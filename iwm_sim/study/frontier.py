@@ -225,19 +225,10 @@ def margin(point: Point, rivals: Sequence[Point], count: str) -> float | None:
 def _bound(place: Place, reference: _Reference, ours: Run, others: Sequence[Point], point: Point) -> Point:
     """The best of all schedules tried that change no more often than a point of ours, and of what strategies did."""
     found = [p for p in others if p.saving_percent is not None and p.changes_per_min <= point.changes_per_min + 1e-9]
+    period_s = default_settings().decision_period_s
     for run in (reference.run, ours):
-        share = _schedule(place, run, point.changes_per_min)
+        share = preview.schedule(run, period_s, place.vehicle.params, place.friction, point.changes_per_min)
         table = empty_table(schedule=share.tolist())
         found.append(_point("preview", point.setting, drive(place, "preview", table), place, reference))
     best = max(found, key=lambda p: -np.inf if p.saving_percent is None else p.saving_percent)
     return best._replace(strategy="preview", setting=point.setting, policy="")
-
-
-def _schedule(place: Place, run: Run, changes_per_min: float) -> FloatArray:
-    """The cheapest schedule for the demand of a run with at most so many changes a minute."""
-    most = changes_per_min * run.series.shape[0] * run.dt_s / 60.0
-    period = default_settings().decision_period_s
-    demand, speed = run["power_demand_w"], run["speed_mps"]
-    share = empty_table().share
-    cost = preview.step_costs(demand, speed, run.dt_s, period, place.vehicle.params, place.friction, share)
-    return preview.cheapest_within(cost, share, most)

@@ -76,10 +76,7 @@ def jobs() -> Iterator[Job]:
         return closed_loop.run(cycle, vehicle, settings, table, 0.9, until_s=0.1)
 
     def schedule_known_ahead() -> None:
-        run = closed_loop_run()
-        share = table.share
-        cost = preview.step_costs(run["power_demand_w"], run["speed_mps"], 0.01, 0.1, vehicle.params, 0.9, share)
-        preview.cheapest_schedule(cost, share)
+        preview.schedule(closed_loop_run(), 0.1, vehicle.params, 0.9)
 
     def solver() -> None:
         axes = {"power_w": [-1000, 0, 1000], "speed_mps": [0, 2], "share": [0, 0.5, 1]}
