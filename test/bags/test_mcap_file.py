@@ -8,6 +8,7 @@ import io
 from pathlib import Path
 from typing import IO
 
+import mcap
 import pytest
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
@@ -56,8 +57,12 @@ def test_a_finished_file_holds_every_message_with_valid_checksums_and_index(tmp_
         assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [("extra", {"a": "1", "b": ""})]
 
 
+@pytest.mark.parametrize("version", [mcap.__version__, "of another release"])
 @pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_the_bytes_are_those_of_the_package_alone(tmp_path: Path, compression: str) -> None:
+def test_the_bytes_are_those_of_the_package_alone(
+    tmp_path: Path, compression: str, version: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcap, "__version__", version)
     file = McapFile(tmp_path / "a.mcap", library="test", compression=compression, chunk_bytes=4096)
     alone = Writer(plain := io.BytesIO(), chunk_size=4096, compression=CompressionType[compression.upper()])
     alone.start("ros2", "test")
