@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from iwm_power_manager.control.axle import (
+    UNEQUAL_S,
     Pair,
     Shared,
     alike_wheels,
@@ -13,6 +14,7 @@ from iwm_power_manager.control.axle import (
     pair_of,
     shared_of,
     slip_targets,
+    speed_part,
     unequal_s,
     yaw_moments_nm,
 )
@@ -31,6 +33,7 @@ from iwm_power_manager.control.types import (
     Wheels,
 )
 from iwm_power_manager.control.wheel import wheel_after, wheel_slip
+from iwm_power_manager.control.yaw import YawState, with_yaw, yaw_step
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.gate import gated_split
 from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
@@ -68,7 +71,10 @@ def drive(
 
     s = settings
     front_s, rear_s = state.front_unequal_s, state.rear_unequal_s
-    targets = slip_targets(front_s, braking, s)
+    lasting_s = front_s if abs(front_s) > UNEQUAL_S else 0.0
+    growth = speed_part(speed, s) * s.yaw_rate_growth_nmps
+    yaw = yaw_step(state.yaw, measurement.yaw_rate_radps, lasting_s, growth, braking, dt)
+    targets = slip_targets(front_s, braking, yaw.believed, s)
     front_alike = alike_wheels(0, measurement, before, targets)
     rear_alike = alike_wheels(2, measurement, before, targets)
 
@@ -89,6 +95,8 @@ def drive(
     slips = (fl_slip, fr_slip, rl_slip, rr_slip)
     front_nm = yaw_moments_nm(s.front_yaw_nm, s.front_yaw_growth_nmps, s.front_yaw_most_nm, front_s, speed, braking, s)
     rear_nm = yaw_moments_nm(s.rear_yaw_nm, s.rear_yaw_growth_nmps, s.rear_yaw_most_nm, rear_s, speed, braking, s)
+    if braking:
+        front_nm, rear_nm = with_yaw(front_nm, rear_nm, front_s, yaw)
     front = pair_of(
         0, measurement, slips, speed, lower_part, mode, targets, front_nm, first, before, front_alike, vehicle.front, s,
         vehicle,
@@ -99,7 +107,7 @@ def drive(
     )  # fmt: skip
     # Without slip control nothing keeps a single axle from locking.
     share = memory.applied_share if slip_control else 0.5
-    return _commanded(measurement, speed, front, rear, front_slip, rear_slip, memory, share, state, settings, vehicle)
+    return _commanded(measurement, speed, front, rear, front_slip, rear_slip, memory, yaw, share, state, settings, vehicle)
 
 
 @kernel
@@ -111,6 +119,7 @@ def _commanded(
     front_slip: float,
     rear_slip: float,
     memory: SplitMemory,
+    yaw: YawState,
     share: float,
     state: ControllerState,
     settings: Settings,
@@ -177,6 +186,7 @@ def _commanded(
         wheels=_wheels_after(front, rear, motor, (fl_nm, fr_nm, rl_nm, rr_nm), state.wheels, dt, vehicle),
         front_unequal_s=unequal_s(state.front_unequal_s, front.left, front.right, front_apart, dt),
         rear_unequal_s=unequal_s(state.rear_unequal_s, rear.left, rear.right, rear_apart, dt),
+        yaw=yaw,
         motion=state.motion,
         travel=state.travel,
         hold_nm=state.hold_nm,

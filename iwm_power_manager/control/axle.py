@@ -38,6 +38,9 @@ UNEQUAL_S = 0.03
 UNEQUAL_PART = 0.2
 #: The yaw budget grows with one over the square of the speed, up to the square of this.
 MOST_YAW_SPEED = 2.0
+#: Slip of the front wheel that grips, and of the rear ones, where the yaw rate is watched.
+WATCHED_SLIP = 0.1
+WATCHED_REAR_SLIP = 0.06
 
 
 class Given(NamedTuple):
@@ -97,19 +100,27 @@ def unequal_s(before_s: float, left: Wheel, right: Wheel, wanted: bool, dt_s: fl
 
 
 @kernel
-def slip_targets(unequal_s: float, braking: bool, settings: Settings) -> Wheels:
+def slip_targets(unequal_s: float, braking: bool, watched: bool, settings: Settings) -> Wheels:
     """Slip the limiter holds each wheel at.
 
     Unequal torques of the front wheels have to be steered against, with the front wheel that grips; and they turn the
-    car, which the rear wheels keep straight: both need to keep something of their grip for that.
+    car, which the rear wheels keep straight: both need to keep something of their grip for that; less of it where the
+    yaw rate is `watched`.
     """
     most = settings.slip_target
     if not braking or abs(unequal_s) <= UNEQUAL_S:
         return (most, most, most, most)
-    high = min(most, settings.unequal_slip_target)
+    high = min(most, max(settings.unequal_slip_target, WATCHED_SLIP if watched else 0.0))
     low = min(most, settings.unequal_low_slip_target)
-    rear = min(most, settings.unequal_rear_slip_target)
+    rear = min(most, max(settings.unequal_rear_slip_target, WATCHED_REAR_SLIP if watched else 0.0))
     return (high, low, rear, rear) if unequal_s > 0.0 else (low, high, rear, rear)
+
+
+@kernel
+def speed_part(speed_mps: float, settings: Settings) -> float:
+    """Part of a yaw budget at a speed: how far a moment takes the car aside goes with the square of the speed."""
+    part = min(settings.yaw_speed_mps / max(speed_mps, MOVING_MPS), MOST_YAW_SPEED)
+    return part * part
 
 
 @kernel
@@ -124,13 +135,12 @@ def yaw_moments_nm(
 ) -> tuple[float, float]:
     """Yaw moments that more torque left, and more torque right, may have.
 
-    How far a moment takes the car aside until it is steered against goes with the square of the speed. Motors pull far
-    less than brakes, and most at low speed: driving, all of it is there at once.
+    Motors pull far less than brakes, and most at low speed: driving, all of it is there at once.
     """
     if not braking:
         return most_nm, most_nm
-    part = min(settings.yaw_speed_mps / max(speed_mps, MOVING_MPS), MOST_YAW_SPEED)
-    now, growth = part * part * now_nm, part * part * growth_nmps
+    part = speed_part(speed_mps, settings)
+    now, growth = part * now_nm, part * growth_nmps
     return min(now + growth * max(unequal_s, 0.0), most_nm), min(now + growth * max(-unequal_s, 0.0), most_nm)
 
 

@@ -224,6 +224,7 @@ class Controller:
             direction=monitor.direction,
             motor_stuck_nm=self.actuators.stuck_nm,
             acceleration_mps2=monitor.acceleration_mps2(now_ns),
+            yaw_rate_radps=monitor.yaw_rate_radps(now_ns),
         )
 
     def _settings(self) -> Settings:

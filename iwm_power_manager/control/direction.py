@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from iwm_power_manager.control.motion import Motion
 from iwm_power_manager.control.types import ControllerState, Measurement, MotionState, WheelState
+from iwm_power_manager.control.yaw import no_yaw
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.parameters import Axle, VehicleParams
@@ -37,7 +38,9 @@ def _turned(wheel: WheelState) -> WheelState:
 def turned_to(state: ControllerState, motion: MotionState, travel: float) -> ControllerState:
     """What is remembered, in the direction of travel of this step, with what is known of the motion now."""
     a, b, c, d = state.wheels
+    yaw = state.yaw
     if travel != state.travel:
+        yaw = no_yaw()
         a, b, c, d = _turned(a), _turned(b), _turned(c), _turned(d)
     return ControllerState(
         steps=state.steps,
@@ -45,6 +48,7 @@ def turned_to(state: ControllerState, motion: MotionState, travel: float) -> Con
         wheels=(a, b, c, d),
         front_unequal_s=state.front_unequal_s,
         rear_unequal_s=state.rear_unequal_s,
+        yaw=yaw,
         motion=motion,
         travel=travel,
         hold_nm=state.hold_nm,

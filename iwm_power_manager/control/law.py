@@ -62,6 +62,7 @@ def _believed(measurement: Measurement, motion: Motion, travel: float, settings:
         m.direction,
         (travel * stuck[0], travel * stuck[1], travel * stuck[2], travel * stuck[3]),
         m.acceleration_mps2,
+        travel * m.yaw_rate_radps,
     )
 
 
@@ -154,6 +155,7 @@ def step(
         wheels=after.wheels,
         front_unequal_s=after.front_unequal_s,
         rear_unequal_s=after.rear_unequal_s,
+        yaw=after.yaw,
         motion=motion_after,
         travel=travel,
         hold_nm=hold,

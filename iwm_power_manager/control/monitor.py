@@ -37,9 +37,10 @@ BATTERY = "battery_state"
 FRICTION = "road_friction"
 
 _NS_PER_S = 1e9
-#: An accelerometer that shows more, m/s2, or is silent for longer, s, says nothing.
+#: An accelerometer or a gyroscope that shows more, m/s2 and rad/s, or is silent for longer, s, says nothing.
 _MOST_MPS2 = 30.0
-_ACCELERATION_OLDEST_S = 0.1
+_MOST_RADPS = 10.0
+_IMU_OLDEST_S = 0.1
 #: Refused for what was accepted before, not for what they are.
 _REFUSED_BY_ANOTHER = (Violation.TOO_FAST, Violation.STAMP_NOT_NEWER)
 #: Refused for its values.
@@ -205,6 +206,12 @@ class Tally:
         return False
 
 
+def _heard(last: tuple[float, int], now_ns: int) -> float:
+    """The last number of an optional sensor, with its time; NaN where it has been silent for long."""
+    value, heard_ns = last
+    return value if now_ns - heard_ns <= _IMU_OLDEST_S * _NS_PER_S else math.nan
+
+
 class InputMonitor:
     """Latest good inputs.
 
@@ -241,6 +248,7 @@ class InputMonitor:
         self.verdicts = (WheelVerdict.GOOD,) * 4
         self.motor_torque_nm: Wheels | None = None
         self._acceleration = (math.nan, 0)
+        self._yaw_rate = (math.nan, 0)
         self._wheel_memory = NEW_WHEELS
         self.forget_times()
 
@@ -361,8 +369,16 @@ class InputMonitor:
 
     def acceleration_mps2(self, now_ns: int) -> float:
         """Acceleration as an accelerometer shows it; NaN where there is none, or it has been silent for long."""
-        value, heard_ns = self._acceleration
-        return value if now_ns - heard_ns <= _ACCELERATION_OLDEST_S * _NS_PER_S else math.nan
+        return _heard(self._acceleration, now_ns)
+
+    def take_yaw_rate(self, yaw_rate_radps: float, now_ns: int) -> None:
+        """Keep what a gyroscope shows, positive to the left."""
+        if abs(yaw_rate_radps) <= _MOST_RADPS:
+            self._yaw_rate = (yaw_rate_radps, now_ns)
+
+    def yaw_rate_radps(self, now_ns: int) -> float:
+        """Yaw rate as a gyroscope shows it; NaN where there is none, or it has been silent for long."""
+        return _heard(self._yaw_rate, now_ns)
 
     def take_demand(self, demand_w: float, delay_s: float, now_ns: int, lag_s: float = 0.0) -> bool:
         """Judge `power_demand`, received `delay_s` after it was sent; True if it was accepted.

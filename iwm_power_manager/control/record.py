@@ -44,6 +44,8 @@ _MEASUREMENT = (
     *(Signal(f"{wheel}_motor_stuck_nm", "torque the motor has whatever it is commanded") for wheel in WHEEL_NAMES),
     Signal("acceleration_mps2", "forward, of an accelerometer, the slope's part included"),
     Signal("accelerometer", "1 where there is one, 0 where not"),
+    Signal("yaw_rate_radps", "of a gyroscope, positive to the left"),
+    Signal("gyroscope", "1 where there is one, 0 where not"),
 )
 _COMMAND = (
     *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in WHEEL_NAMES),
@@ -131,6 +133,8 @@ def to_numbers(
         *measurement.motor_stuck_nm,
         0.0 if math.isnan(measurement.acceleration_mps2) else measurement.acceleration_mps2,
         0.0 if math.isnan(measurement.acceleration_mps2) else 1.0,
+        0.0 if math.isnan(measurement.yaw_rate_radps) else measurement.yaw_rate_radps,
+        0.0 if math.isnan(measurement.yaw_rate_radps) else 1.0,
         *decided,
         *supervision[:4],
         watch.wheels_lost,
@@ -143,7 +147,7 @@ def to_numbers(
 #: What a record that is older than a signal would have said.
 YOUNGER_SIGNALS = (
     {"gated_wheels": 0.0, "doubted": 0.0, "hold_nm": 0.0, "direction": 1.0}
-    | {"acceleration_mps2": 0.0, "accelerometer": 0.0}
+    | {"acceleration_mps2": 0.0, "accelerometer": 0.0, "yaw_rate_radps": 0.0, "gyroscope": 0.0}
     | {f"{wheel}_brake_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_stuck_nm": 0.0 for wheel in WHEEL_NAMES}
@@ -224,6 +228,7 @@ def measurement_of(numbers: Sequence[float]) -> Measurement:
         direction=n[15],
         motor_stuck_nm=(n[16], n[17], n[18], n[19]),
         acceleration_mps2=n[20] if n[21] else math.nan,
+        yaw_rate_radps=n[22] if n[23] else math.nan,
     )
 
 

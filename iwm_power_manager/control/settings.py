@@ -126,6 +126,16 @@ class Settings(NamedTuple):
     ] = 20.0
     front_yaw_growth_nmps: Annotated[float, Setting("growth of it while it is used", "N m/s", 0.0, 1e6)] = 150.0
     front_yaw_most_nm: Annotated[float, Setting("what it grows to", "N m", 0.0, 1e5)] = 600.0
+    # A driver half as fast again as most keeps his lane with it.
+    yaw_rate_growth_nmps: Annotated[
+        float,
+        Setting(
+            "further growth, up to 1500 N m, while a yaw rate shows that the car hardly turns; 0: none is used",
+            "N m/s",
+            0.0,
+            1e6,
+        ),
+    ] = 600.0
     # The rear wheels keep the car straight: both get what the one with less grip can take (select-low).
     rear_yaw_nm: Annotated[
         float,

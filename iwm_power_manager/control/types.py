@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from iwm_power_manager.control.budget import Used
 from iwm_power_manager.control.persistence import Jitter, no_jitter
+from iwm_power_manager.control.yaw import YawState, no_yaw
 
 Wheels = tuple[float, float, float, float]  # in the order of `WHEEL_NAMES`
 
@@ -61,6 +62,7 @@ class Measurement(NamedTuple):
     direction : the driver asks for, 1 forwards, -1 reverse
     motor_stuck_nm : torque that a motor has whatever it is commanded; friction makes up for it while braking
     acceleration_mps2 : forward, of an accelerometer on the body, the slope's part included (NaN: there is none)
+    yaw_rate_radps : of a gyroscope on the body, positive to the left (NaN: there is none)
     """
 
     speed_mps: float
@@ -75,6 +77,7 @@ class Measurement(NamedTuple):
     direction: float = 1.0
     motor_stuck_nm: Wheels = (0.0, 0.0, 0.0, 0.0)
     acceleration_mps2: float = math.nan
+    yaw_rate_radps: float = math.nan
 
 
 class Command(NamedTuple):
@@ -287,6 +290,7 @@ class ControllerState(NamedTuple):
     wheels : of each wheel
     front_unequal_s, rear_unequal_s : how long the wheels of the axle have been kept at unequal torques; it lets their
         yaw budget grow
+    yaw : of the yaw rate
     motion : of the estimate of speed and direction
     travel : direction of travel the torques and speeds of `wheels` are reckoned in: 1 forwards, -1 backwards
     hold_nm : friction torque of each wheel that holds the car on a slope
@@ -298,6 +302,7 @@ class ControllerState(NamedTuple):
     wheels: FourWheels
     front_unequal_s: float
     rear_unequal_s: float
+    yaw: YawState
     motion: MotionState
     travel: float
     hold_nm: float
@@ -330,6 +335,7 @@ def initial_state() -> ControllerState:
         wheels=(wheel, wheel, wheel, wheel),
         front_unequal_s=0.0,
         rear_unequal_s=0.0,
+        yaw=no_yaw(),
         motion=MotionState(
             speed_mps=0.0,
             bias_mps2=0.0,
