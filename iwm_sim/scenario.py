@@ -19,7 +19,7 @@
     until: {time_s: 30.0, standstill: true}   # the end; standstill needs a time as well
     foreign_brakes:                           # of another system; the power manager has no friction brakes then
       - {from_s: 2.0, braking_mps2: 6.0}
-    imu: false                                # whether the power manager hears the accelerometer
+    imu: false                                # whether the power manager hears the IMU
     faults:
       - {sensor: vehicle_speed, factor: 1.2, from_s: 2.0, until_s: 4.0}
       - {actuator: motor_front_left, dead: true, from_s: 2.0}
@@ -120,7 +120,7 @@ class Scenario:
     truth : the car as it is, load included; `vehicle` is what power manager and driver believe in
     steering : (from_s, angle of the steering wheel in rad); None for the driver who keeps the lane
     foreign_brakes : (from_s, deceleration in m/s2) of another system, which has the friction brakes
-    imu : the power manager hears the accelerometer
+    imu : the power manager hears accelerometer and gyroscope
     """
 
     name: str

@@ -107,7 +107,9 @@ def drive(
     )  # fmt: skip
     # Without slip control nothing keeps a single axle from locking.
     share = memory.applied_share if slip_control else 0.5
-    return _commanded(measurement, speed, front, rear, front_slip, rear_slip, memory, yaw, share, state, settings, vehicle)
+    return _commanded(
+        measurement, speed, front, rear, front_slip, rear_slip, memory, yaw, share, state, settings, vehicle
+    )
 
 
 @kernel

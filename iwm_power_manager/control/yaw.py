@@ -5,7 +5,7 @@ Without one, the budget grows at a rate that any driver can steer against. A gyr
 as the car hardly turns towards the side with more grip, more of that grip can be used; where it does turn, less, at
 once. The rate counts relative to what it was before, so that neither a bend nor a bias of the sensor does. It is
 believed where, by it, the car has first turned as unequal brakes turn a car: a sensor that stands still, or has its
-sign wrong, does not show that. One that shows the car turning off to the other side is wrong, since nobody steers there.
+sign wrong, does not show that. One that later shows the car turning off to the other side is not believed any more.
 Without a rate that is believed, what was added fades.
 """
 
@@ -27,7 +27,7 @@ ASTRAY_RAD = -0.15
 SAME_S = 0.1
 #: Rate towards the side with more grip beyond which less is added than before, rad/s.
 CALM_RADPS = 0.03
-#: The budget is less by this for each rad/s, N m s: some four times what the tyres do against it at 25 m/s.
+#: The budget is less by this for each rad/s, N m s: some six times what the tyres do against it at 25 m/s.
 DAMPING_NMS = 16000.0
 #: Most that is added in front; the rear wheels get this part of it, which leaves them what keeps the car straight.
 MOST_NM = 1500.0

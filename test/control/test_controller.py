@@ -367,12 +367,16 @@ class TestRecord:
             assert again == command
         assert sum(from_numbers(list(values.values())).first for values in drive.steps) == 2
 
-    def test_what_an_accelerometer_shows_is_recorded_and_so_is_its_silence(self, drive) -> None:
+    def test_what_an_imu_shows_is_recorded_and_so_is_its_silence(self, drive) -> None:
         drive.run(60, demand=9000.0)
         drive.controller.monitor.take_acceleration(-3.5, drive.now_ns)
+        drive.controller.monitor.take_yaw_rate(0.2, drive.now_ns)
+        drive.controller.monitor.take_yaw_rate(-10.1, drive.now_ns)  # no car's
         heard, *_, silent = [drive.step() for _ in range(40)]
-        measured = [from_numbers(list(values.values())).measurement.acceleration_mps2 for values in (heard, silent)]
-        assert measured == [-3.5, pytest.approx(math.nan, nan_ok=True)]
+        measured = [from_numbers(list(values.values())).measurement for values in (heard, silent)]
+        nothing = pytest.approx(math.nan, nan_ok=True)
+        assert [m.acceleration_mps2 for m in measured] == [-3.5, nothing]
+        assert [m.yaw_rate_radps for m in measured] == [0.2, nothing]
 
     def test_reset_forgets_inputs_and_memory(self, drive) -> None:
         drive.run(60, demand=9000.0)

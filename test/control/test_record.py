@@ -40,6 +40,7 @@ MEASUREMENT = Measurement(
     direction=unlike(),
     motor_stuck_nm=four(),
     acceleration_mps2=unlike(),
+    yaw_rate_radps=unlike(),
 )
 COMMAND = Command(
     motor_torque_nm=four(),
@@ -101,6 +102,8 @@ def test_every_number_stands_under_its_own_name():
         **of_wheels("{}_motor_stuck_nm", MEASUREMENT.motor_stuck_nm),
         "acceleration_mps2": MEASUREMENT.acceleration_mps2,
         "accelerometer": 1.0,
+        "yaw_rate_radps": MEASUREMENT.yaw_rate_radps,
+        "gyroscope": 1.0,
         **of_wheels("{}_motor_torque_nm", COMMAND.motor_torque_nm),
         **of_wheels("{}_friction_torque_nm", COMMAND.friction_torque_nm),
         **of_wheels("{}_brake_gain", COMMAND.brake_gain),
@@ -154,18 +157,25 @@ def test_only_step_zero_is_a_run_s_first(steps):
     assert (record.from_numbers(values).first, record.step_of(values)) == (steps == 0, steps)
 
 
-def test_a_car_without_an_accelerometer_has_none_after_the_record_either():
-    silent = MEASUREMENT._replace(acceleration_mps2=math.nan)
+IMU = pytest.mark.parametrize(
+    ("number", "sensor"), [("acceleration_mps2", "accelerometer"), ("yaw_rate_radps", "gyroscope")]
+)
+
+
+@IMU
+def test_a_car_without_an_accelerometer_or_gyroscope_has_none_after_the_record_either(number, sensor):
+    silent = MEASUREMENT._replace(**{number: math.nan})
     decided = record.decided(COMMAND, BEFORE, BEFORE)
     named = dict(
         zip(record.SIGNAL_NAMES, record.to_numbers(silent, SETTINGS, decided, SUPERVISION, WATCH), strict=True)
     )
-    assert (named["acceleration_mps2"], named["accelerometer"]) == (0.0, 0.0)
-    assert math.isnan(record.measurement_of(list(named.values())).acceleration_mps2)
+    assert (named[number], named[sensor]) == (0.0, 0.0)
+    assert math.isnan(getattr(record.measurement_of(list(named.values())), number))
 
 
-def test_an_accelerometer_that_shows_nothing_is_one():
-    assert record.measurement_of(with_number("acceleration_mps2", 0.0)).acceleration_mps2 == 0.0
+@IMU
+def test_an_accelerometer_or_gyroscope_that_shows_nothing_is_one(number, sensor):
+    assert getattr(record.measurement_of(with_number(number, 0.0)), number) == 0.0
 
 
 @pytest.mark.parametrize("largest", [0.0, 1.0, 2.0**53 - 1])

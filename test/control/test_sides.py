@@ -44,6 +44,10 @@ TABLE = empty_table()
 SCENES = range(600 if numba_config.DISABLE_JIT else 1500)
 
 
+#: What is positive to the left, or for the left wheels.
+SIDED = ("front_unequal_s", "rear_unequal_s", "yaw_rate_radps", "straight_radps", "shown_radps")
+
+
 class Turn:
     """A way of looking at a car from another side."""
 
@@ -86,7 +90,7 @@ class Mirrored(Turn):
 
     def bits(self, value: Any) -> Any:
         value = super().bits(value)
-        more = {name: -getattr(value, name) for name in ("front_unequal_s", "rear_unequal_s") if hasattr(value, name)}
+        more = {name: -getattr(value, name) for name in SIDED if hasattr(value, name)}
         return value._replace(**more)
 
 
@@ -248,6 +252,7 @@ class Scene:
             motor_gain=d.of((1.0,) * 4, d.four(lambda: d.of(1.0, 1.0, 0.5, 0.0))),
             motor_stuck_nm=d.of((0.0,) * 4, (0.0,) * 4, d.four(lambda: d.of(0.0, 20.0, -30.0))),
             acceleration_mps2=d.of(math.nan, d.between(-9.0, 9.0)),
+            yaw_rate_radps=d.of(math.nan, d.between(-0.2, 0.2)),
         )
 
     def state(self) -> ControllerState:

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a yaw rate adds to the yaw budget, when it is believed, and that nothing changes without one."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from iwm_power_manager.control.yaw import MOST_NM, no_yaw, with_yaw, yaw_step
+
+DT = 0.01
+GROWTH = 600.0
+SIDES = pytest.mark.parametrize("side", [1.0, -1.0], ids=["more left", "more right"])
+
+
+def ahead(rate=0.0, time_s=1.0):
+    """What is known after wheels that braked alike."""
+    yaw = no_yaw()
+    for _ in range(round(time_s / DT)):
+        yaw = yaw_step(yaw, rate, 0.0, GROWTH, False, DT)
+    return yaw
+
+
+def braked(yaw, rates, side=1.0, braking=True, growth=GROWTH, since_s=0.0):
+    """What is known after unequal braking with these yaw rates towards the side with more grip."""
+    for k, rate in enumerate(rates):
+        yaw = yaw_step(yaw, side * rate, side * (since_s + 0.04 + k * DT), growth, braking, DT)
+    return yaw
+
+
+def turning(time_s=0.5):
+    """A car that is turned, and steered straight again; no two numbers are the same."""
+    return [0.03 + 1e-6 * k for k in range(30)] + [0.001 + 1e-6 * k for k in range(round(time_s / DT))]
+
+
+def believed(side=1.0):
+    return braked(ahead(), turning(), side)
+
+
+@SIDES
+def test_while_the_car_hardly_turns_the_budget_grows_and_where_it_turns_it_is_less(side):
+    yaw = believed(side)
+    assert yaw.believed
+    calm = braked(yaw, [0.001, 0.0011], side, since_s=1.0)
+    assert calm.extra_nm == pytest.approx(yaw.extra_nm + 2 * GROWTH * DT, rel=0.05)
+    away = braked(yaw, [-0.02, -0.021], side, since_s=1.0)
+    assert away.extra_nm == pytest.approx(yaw.extra_nm + 2 * GROWTH * DT)
+    quick = braked(yaw, [0.06, 0.061], side, since_s=1.0)
+    assert 0.0 < quick.extra_nm < yaw.extra_nm
+    own = 0 if side > 0.0 else 1
+    budgets = [with_yaw((100.0, 100.0), (0.0, 0.0), side, state) for state in (calm, away, quick)]
+    front = [front[own] for front, _ in budgets]
+    assert front[2] == 0.0 < front[0] < front[1] == 100.0 + away.extra_nm
+    assert {front[1 - own] for front, _ in budgets} == {100.0}
+    rear = [rear[own] for _, rear in budgets]
+    assert rear[2] == 0.0 < rear[0] < rear[1] < front[1] - 100.0
+    assert {rear[1 - own] for _, rear in budgets} == {0.0}
+
+
+@SIDES
+@pytest.mark.parametrize("bias", [0.05, -0.05, 0.3])
+def test_a_bias_or_a_bend_changes_nothing(side, bias):
+    yaw = braked(ahead(bias), [rate + side * bias for rate in turning()], side)
+    assert yaw.extra_nm == pytest.approx(believed(side).extra_nm)
+
+
+@SIDES
+@pytest.mark.parametrize(
+    "rates",
+    [[0.0] * 400, [-rate for rate in turning(4.0)], [-0.03 + 1e-6 * k for k in range(100)] + turning(4.0)],
+    ids=["stuck", "wrong sign", "turned the other way first"],
+)
+def test_a_sensor_that_does_not_show_what_unequal_brakes_do_adds_nothing(side, rates):
+    yaw = braked(ahead(), rates, side)
+    assert (yaw.believed, yaw.extra_nm) == (False, 0.0)
+    assert with_yaw((50.0, 60.0), (0.0, 1.0), side, yaw) == ((50.0, 60.0), (0.0, 1.0))
+
+
+def test_a_sensor_that_is_heard_too_late_adds_nothing():
+    assert braked(ahead(time_s=0.1), turning()).extra_nm == 0.0
+    assert braked(no_yaw(), turning()).extra_nm == 0.0
+
+
+@pytest.mark.parametrize(
+    "rates",
+    [[math.nan] * 100, [0.02] * 100, [-0.3 + 1e-6 * k for k in range(150)]],
+    ids=["silent", "stuck", "turning off to the other side"],
+)
+def test_what_was_added_fades_where_the_sensor_fails_during_the_braking(rates):
+    yaw = believed()
+    states = [yaw]
+    for k, rate in enumerate(rates):
+        states.append(braked(states[-1], [rate], since_s=1.0 + k * DT))
+    assert not states[-1].believed
+    lost = next(k for k, state in enumerate(states) if not state.believed)
+    assert lost * DT <= 0.55
+    for before, after in zip(states[lost - 1 :], states[lost:], strict=False):
+        assert after.extra_nm == pytest.approx(max(before.extra_nm - GROWTH * DT, 0.0))
+    again = braked(states[-1], turning(), since_s=2.5)
+    assert not again.believed
+
+
+def test_it_grows_to_its_most_only_while_the_car_brakes_and_goes_where_the_wheels_brake_alike():
+    yaw = believed()
+    assert braked(yaw, turning(10.0), since_s=1.0).extra_nm == MOST_NM
+    rolling = braked(yaw, [0.001, 0.002], since_s=1.0, braking=False)
+    assert rolling.extra_nm == pytest.approx(yaw.extra_nm - 2 * GROWTH * DT)
+    alike = yaw_step(yaw, 0.001, 0.0, GROWTH, True, DT)
+    assert (alike.believed, alike.extra_nm, alike.turned_rad) == (False, 0.0, 0.0)
+    assert yaw_step(yaw, math.nan, 0.0, GROWTH, True, DT) == no_yaw()
+
+
+def test_without_growth_the_rate_is_not_used():
+    assert braked(ahead(), turning(), growth=0.0) == no_yaw()
+    yaw = ahead()
+    assert with_yaw((1.0, 2.0), (3.0, 4.0), 0.0, yaw) == ((1.0, 2.0), (3.0, 4.0))
