@@ -48,6 +48,7 @@ from iwm_power_manager.control.speed_doubt import (
 from iwm_power_manager.control.types import FourWheels, Measurement, MotionState, Wheels
 from iwm_power_manager.control.wheel_doubt import (
     SLOW_MPS,
+    WORN_PART,
     clamped,
     combined_factor,
     common_jump,
@@ -162,7 +163,8 @@ def estimate(
     factor, calm_s = before.wheels_factor, 0.0
     if not first:
         jump, calm_s = common_jump(shown, scaled_wheels(factor, raw), wheels, travel, dt, before, vehicle)
-        factor = combined_factor(factor, jump)
+        if jump != 1.0:
+            factor = combined_factor(factor, jump)
     w = scaled_wheels(factor, raw)
     rims = rims_of(w, vehicle)
     turning = turning_of(w, wheels, travel, first, dt, before.wheel_doubt_s, vehicle)
@@ -192,7 +194,9 @@ def estimate(
         doubted=_doubted(trusted, doubt, factor),
     )
     bias = _bias_mps2(before.bias_mps2, shown, sensor.predicted_mps, trusted, rolling, dt)
-    compared, told, anew = compared_speeds(shown, rims, turning, sensor.apart_s, factor, before.compared, dt)
+    compared, told, anew = compared_speeds(
+        shown, rims, turning, sensor.apart_s, factor, before.compared, trusted and rolling.believed == 4, dt
+    )
     if anew:
         # In the next step the wheels change without a torque.
         return motion, fresh_motion(mean_of(rims) * told / factor, bias, shown, before.brake_gain, told, compared, dt)
@@ -208,7 +212,7 @@ def estimate(
         wheel_doubt_s=doubt,
         agreed=agreed,
         brake_gain=before.brake_gain,
-        wheels_factor=factor,
+        wheels_factor=told,
         calm_s=calm_s,
         compared=compared,
     )
@@ -220,6 +224,6 @@ def _doubted(trusted: bool, doubt_s: Wheels, factor: float) -> int:
     """Bits of what is not believed."""
     bits = 0 if trusted else DOUBT_SPEED
     for i in range(4):
-        if doubt_s[i] > 0.0 or factor != 1.0:
+        if doubt_s[i] > 0.0 or abs(factor - 1.0) > WORN_PART:
             bits |= 1 << i
     return bits

@@ -15,6 +15,7 @@ from iwm_power_manager.control.wheel_doubt import (
     SPEED_PART,
     WORN_PART,
     Turning,
+    clamped,
     combined_factor,
     mean_of,
 )
@@ -37,6 +38,9 @@ LEAST_PART = 0.72
 #: and faster than this: slower, a sensor that is off by a few tenths of a m/s would look like one that is wrong by a
 #: factor, and beyond the last speed one that is off by 5 m/s, where the wheels are believed.
 COMPARED_S, COMPARED_MPS, COMPARED_MOST_MPS = 0.2, 2.0, 12.5
+#: From then on what the wheels show more or less than the sensor is taken off them at the last rate, 1/s, between the
+#: first two and a part of the speed, above a speed: be it tyres or the sensor, so slip is slip.
+WORN_LEAST_PART, WORN_LEAST_MPS, WORN_MOST_PART, WORN_FROM_MPS, WORN_RATE_PER_S = 0.015, 0.05, 0.1, 4.0, 0.05
 
 
 class Rolling(NamedTuple):
@@ -143,7 +147,14 @@ def judged_speed(
 
 @kernel
 def compared_speeds(
-    shown: float, rims: Wheels, t: Turning, apart_s: float, factor: float, before: Compared, dt: float
+    shown: float,
+    rims: Wheels,
+    t: Turning,
+    apart_s: float,
+    factor: float,
+    before: Compared,
+    all_believed: bool,
+    dt: float,
 ) -> tuple[Compared, float, bool]:
     """What sensor and wheels have said of each other by now, the wheels' factor, and whether all begins anew by it."""
     mean = mean_of(rims)
@@ -155,7 +166,11 @@ def compared_speeds(
     if before.lasted_s >= COMPARED_S:
         # Wheels that show by themselves what the sensor does are right again; a wrong sensor is not wrong by a factor.
         over = freely and _unsure(before) and (_same(shown, mean / factor) or apart_s > APART_S)
-        return (Compared(1.0, before.lasted_s), 1.0, True) if over else (before, factor, False)
+        if over:
+            return Compared(1.0, before.lasted_s), 1.0, True
+        # By the sign of the road's force, which is that of the slip: a torque may have turned just now.
+        no_slip = mean_of(t.road_nm) * (mean - shown) < 0.0 or used_friction_of(t.road_nm, t) < ICE_FRICTION
+        return before, _worn(shown - mean, mean, factor, dt) if all_believed and no_slip else factor, False
     lasted_s = before.lasted_s + dt
     ratio = before.ratio + dt / lasted_s * (shown / mean - before.ratio)
     if lasted_s < COMPARED_S:
@@ -164,6 +179,16 @@ def compared_speeds(
     if same or not LEAST_PART < ratio < 1.0 / LEAST_PART or abs(mean) > COMPARED_MOST_MPS:
         ratio = 1.0
     return Compared(ratio, lasted_s), combined_factor(factor, ratio), not same
+
+
+@kernel
+def _worn(over: float, mean: float, factor: float, dt: float) -> float:
+    """The wheels' factor, with a little of a small difference to the sensor taken off."""
+    size, off = abs(mean), abs(over)
+    if size <= WORN_FROM_MPS or not WORN_LEAST_PART * size + WORN_LEAST_MPS < off < WORN_MOST_PART * size:
+        return factor
+    after = factor * (1.0 + clamped(over / mean, WORN_RATE_PER_S * dt))
+    return after if abs(after - 1.0) <= WORN_MOST_PART else factor
 
 
 @kernel

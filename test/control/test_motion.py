@@ -285,7 +285,7 @@ def test_wheels_that_slip_together_on_the_smoothest_ice_contradict_no_sensor_and
     assert against[-1] != 0, "no torque makes them slip that way"
 
 
-@pytest.mark.parametrize("factor", [0.6, 0.97, 1.03, 1.6])
+@pytest.mark.parametrize("factor", [0.6, 0.985, 1.015, 1.6])
 def test_sensor_and_wheels_that_are_nearly_the_same_or_far_apart_are_no_factor_apart(factor):
     car = Car(20.0)
     for _ in range(100):
@@ -295,6 +295,32 @@ def test_sensor_and_wheels_that_are_nearly_the_same_or_far_apart_are_no_factor_a
     assert motion.doubted == (0 if near else DOUBT_SPEED)
     assert motion.speed_mps == pytest.approx(factor * v if near else v, rel=0.01)
     assert motion.wheel_speed_radps == (v / RADIUS,) * 4
+
+
+@pytest.mark.parametrize("factor", [0.955, 0.97, 1.03, 1.045])
+@pytest.mark.parametrize("speed", [6.0, 20.0, -6.0])
+def test_a_small_difference_of_sensor_and_rolling_wheels_is_no_slip(factor, speed):
+    """Worn tyres, or a sensor that is off by little: it had to be told from slip when the brakes are at their limit."""
+    car = Car(speed)
+    for k in range(120):
+        v = car.v
+        motion = car.step(0.0, lambda v: factor * v)
+        turned = motion.wheel_speed_radps[0] * RADIUS / v
+        assert abs(turned - 1.0) <= abs(factor - 1.0)
+        assert k > 20 or abs(turned - 1.0) < 0.012  # by no jump
+    assert turned == pytest.approx(factor, abs=0.016 + 0.05 / abs(speed))
+    assert motion.doubted == 0
+    for _ in range(100):
+        v = car.v
+        motion = car.step(0.0)
+    assert motion.wheel_speed_radps[0] * RADIUS / v == pytest.approx(1.0, abs=0.016 + 0.05 / abs(speed))
+
+
+def test_a_difference_of_sensor_and_wheels_is_left_alone_where_slip_makes_it():
+    car = Car(20.0)
+    for _ in range(100):
+        motion = car.step(40.0, spoil_wheels=lambda w: tuple(1.03 * x for x in w))
+    assert motion.wheel_speed_radps[0] * RADIUS > 1.02 * car.v
 
 
 @pytest.mark.parametrize("factor", [1.3, 1.7, 2.0])

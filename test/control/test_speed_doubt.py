@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from iwm_power_manager.control.speed_doubt import (
@@ -69,6 +71,19 @@ def test_at_walking_pace_forces_say_too_little_to_doubt_it():
 @pytest.mark.parametrize("factor", [0.8, 1.25])
 def test_wheels_that_show_by_themselves_what_the_sensor_does_are_right_again(factor):
     before = Compared(factor, COMPARED_S)
-    again = compared_speeds(10.0, (10.0 * factor,) * 4, STILL, 0.0, factor, before, DT)
+    again = compared_speeds(10.0, (10.0 * factor,) * 4, STILL, 0.0, factor, before, True, DT)
     assert again == (Compared(1.0, COMPARED_S), 1.0, True)
-    assert compared_speeds(10.0, (10.0,) * 4, STILL, 0.0, factor, before, DT) == (before, factor, False)
+    assert compared_speeds(10.0, (10.0,) * 4, STILL, 0.0, factor, before, True, DT) == (before, factor, False)
+
+
+@pytest.mark.parametrize("over", [-0.3, 0.3])
+def test_a_small_difference_to_the_wheels_is_taken_off_them_while_all_are_believed(over):
+    before = Compared(1.0, COMPARED_S)
+    wheels = (10.0 - over,) * 4
+    told, factor, anew = compared_speeds(10.0, wheels, STILL, 0.0, 1.0, before, True, DT)
+    assert (told, anew) == (before, False)
+    assert factor == pytest.approx(1.0 + math.copysign(0.05 * DT, over))
+    assert compared_speeds(10.0, wheels, STILL, 0.0, 1.0, before, False, DT) == (before, 1.0, False)
+    for speed, much in ((10.0, 0.1), (10.0, 1.2), (3.0, 0.3)):
+        wheels = (speed - math.copysign(much, over),) * 4
+        assert compared_speeds(speed, wheels, STILL, 0.0, 1.0, before, True, DT) == (before, 1.0, False)

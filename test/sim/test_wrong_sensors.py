@@ -154,6 +154,11 @@ def test_a_speed_that_is_a_little_too_high_takes_no_brakes_for_good_at_the_limit
     assert check_scenario(braking(12.0, 40e3, friction, broken)).values["least_braking"] >= 0.6
 
 
+@pytest.mark.parametrize(("speed_mps", "power_w", "factor"), [(6.05, 58.6e3, 0.955), (15.9, 28.5e3, 0.944)])
+def test_worn_tyres_take_no_brakes_at_the_limit(speed_mps, power_w, factor):
+    it_brakes(speed_mps, power_w, 0.9, (wrong("wheels", "factor", factor, 0.0),))
+
+
 @pytest.mark.parametrize("offset_mps", [-0.5, -0.2, 0.2, 0.3, 0.5])
 @pytest.mark.parametrize("driven_w", [6e3, 12e3])
 def test_a_speed_that_is_a_little_off_from_standstill_on_takes_no_brakes(offset_mps, driven_w):
