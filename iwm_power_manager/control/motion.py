@@ -68,8 +68,9 @@ PULL_OF_FORCES = 0.2
 #: The same for the wheels while the speed sensor is not believed, and for both below `SLOW_MPS`.
 WHEEL_PULL_MPS2 = 1.5
 SLOW_PULL_MPS2 = 8.0
-#: A wheel within this part of the speed, and this, may be rolling: slip and tyre wear are no reason to pull.
-WHEEL_PART, WHEEL_MPS = 0.06, 0.2
+#: A wheel within this part of the speed, and this, may be rolling: slip and tyre wear are no reason to pull. The last
+#: is for wheels that lead by themselves: the forces may not explain what they show.
+WHEEL_PART, WHEEL_MPS, ALONE_MPS = 0.06, 0.2, 0.1
 #: How fast a steady difference is taken for a slope, 1/s2; and while the wheels confirm the sensor.
 BIAS_GAIN_PER_S2, CONFIRMED_GAIN_PER_S2 = 1.5, 6.0
 BIAS_STEP_MPS = 0.3
@@ -114,7 +115,7 @@ def _pulled(
         elif demand_w > 0.0:
             best = rolling.low_mps if predicted >= 0.0 else rolling.high_mps
         error = best - predicted
-        if abs(error) > WHEEL_PART * size + WHEEL_MPS:
+        if abs(error) > WHEEL_PART * size + (WHEEL_MPS if trusted else ALONE_MPS):
             pull = PULL_MPS2
             if not trusted:
                 pull = SLOW_PULL_MPS2 if slow else WHEEL_PULL_MPS2 + PULL_OF_FORCES * abs(forces)

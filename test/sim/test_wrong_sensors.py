@@ -159,6 +159,11 @@ def test_worn_tyres_take_no_brakes_at_the_limit(speed_mps, power_w, factor):
     it_brakes(speed_mps, power_w, 0.9, (wrong("wheels", "factor", factor, 0.0),))
 
 
+@pytest.mark.parametrize(("speed_mps", "power_w", "factor"), [(12.5, 20.4e3, 1.218), (12.6, 22.8e3, 1.231)])
+def test_wheels_that_lead_with_a_speed_that_forces_do_not_explain_take_no_brakes(speed_mps, power_w, factor):
+    it_brakes(speed_mps, power_w, 0.9, (wrong("wheels", "factor", factor, 0.0),))
+
+
 @pytest.mark.parametrize("offset_mps", [-0.5, -0.2, 0.2, 0.3, 0.5])
 @pytest.mark.parametrize("driven_w", [6e3, 12e3])
 def test_a_speed_that_is_a_little_off_from_standstill_on_takes_no_brakes(offset_mps, driven_w):
