@@ -107,9 +107,8 @@ def drive(
     )  # fmt: skip
     # Without slip control nothing keeps a single axle from locking.
     share = memory.applied_share if slip_control else 0.5
-    return _commanded(
-        measurement, speed, front, rear, front_slip, rear_slip, memory, yaw, share, state, settings, vehicle
-    )
+    axle_slips = front_slip, rear_slip
+    return _commanded(measurement, speed, front, rear, axle_slips, memory, yaw, share, state, settings, vehicle)
 
 
 @kernel
@@ -118,8 +117,7 @@ def _commanded(
     speed_mps: float,
     front: Pair,
     rear: Pair,
-    front_slip: float,
-    rear_slip: float,
+    axle_slips: tuple[float, float],
     memory: SplitMemory,
     yaw: YawState,
     share: float,
@@ -128,9 +126,8 @@ def _commanded(
     vehicle: VehicleParams,
 ) -> tuple[Command, ControllerState]:
     """Steps 4 to 7: from the power each axle is asked for to the torques that are commanded."""
-    demand, dt = measurement.power_demand_w, measurement.dt_s
+    demand, dt, wheels = measurement.power_demand_w, measurement.dt_s, state.wheels
     braking = demand < 0.0
-    fl0, fr0, rl0, rr0 = state.wheels
     front_gated = front.left.gated and front.right.gated
     rear_gated = rear.left.gated and rear.right.gated
     front_power, rear_power = gated_split(demand, share, front_gated, rear_gated)
@@ -138,8 +135,8 @@ def _commanded(
     front_given, rear_given = allocate(front_asked, rear_asked, pair_capacity_w(front), pair_capacity_w(rear))
 
     # 5. torque, 6. slew
-    f = shared_of(front_given, front, speed_mps, braking, dt, fl0, fr0, settings, vehicle.front)
-    r = shared_of(rear_given, rear, speed_mps, braking, dt, rl0, rr0, settings, vehicle.rear)
+    f = shared_of(front_given, front, speed_mps, braking, dt, wheels[0], wheels[1], settings, vehicle.front)
+    r = shared_of(rear_given, rear, speed_mps, braking, dt, wheels[2], wheels[3], settings, vehicle.rear)
     tolerance = ROUNDING * abs(demand)
     # Where both axles together fall short, each of them is at its limit, whatever its own part was.
     short = front_asked + rear_asked - front_given - rear_given > tolerance
@@ -169,8 +166,8 @@ def _commanded(
         limits=limits,
         front_power_w=front.left.conversion_radps * fl_nm + front.right.conversion_radps * fr_nm,
         rear_power_w=rear.left.conversion_radps * rl_nm + rear.right.conversion_radps * rr_nm,
-        front_slip=front_slip,
-        rear_slip=rear_slip,
+        front_slip=axle_slips[0],
+        rear_slip=axle_slips[1],
         gated_wheels=_bits(front, rear),
         speed_mps=measurement.speed_mps,
         doubted=0,
@@ -185,7 +182,7 @@ def _commanded(
     after = ControllerState(
         steps=state.steps + 1,
         split=memory,
-        wheels=_wheels_after(front, rear, motor, (fl_nm, fr_nm, rl_nm, rr_nm), state.wheels, dt, vehicle),
+        wheels=_wheels_after(front, rear, motor, (fl_nm, fr_nm, rl_nm, rr_nm), wheels, dt, vehicle),
         front_unequal_s=unequal_s(state.front_unequal_s, front.left, front.right, front_apart, dt),
         rear_unequal_s=unequal_s(state.rear_unequal_s, rear.left, rear.right, rear_apart, dt),
         yaw=yaw,
