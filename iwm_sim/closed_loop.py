@@ -286,6 +286,7 @@ def measure(
         1.0,
         (0.0, 0.0, 0.0, 0.0),
         math.nan,
+        math.nan,
     )
 
 
