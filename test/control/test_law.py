@@ -36,6 +36,7 @@ from iwm_power_manager.control.types import (
     WheelState,
     initial_state,
 )
+from iwm_power_manager.control.yaw import MOST_NM, YawState, no_yaw
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -254,6 +255,20 @@ MEMORIES = st.builds(
     motion=st.just(initial_state().motion),
     travel=st.just(1.0),
     hold_nm=st.just(0.0),
+    yaw=st.just(no_yaw()),
+)
+RATES = st.floats(-1.0, 1.0)
+#: What may be remembered of a gyroscope.
+YAWS = st.builds(
+    YawState,
+    straight_radps=RATES,
+    known_s=SHARES,
+    shown_radps=RATES,
+    same_s=SHARES,
+    turned_rad=RATES,
+    believed=st.booleans(),
+    towards_radps=RATES,
+    extra_nm=st.floats(0.0, MOST_NM),
 )
 
 
@@ -545,6 +560,21 @@ CHECKS = (
 def test_all_of_it_holds_in_any_step(case):
     for check in CHECKS:
         check(case)
+
+
+@settings(max_examples=EXAMPLES)
+@given(
+    measurement=st.builds(lambda m, rate: m._replace(yaw_rate_radps=rate), measurements(), RATES),
+    state=st.builds(lambda state, yaw: state._replace(yaw=yaw), MEMORIES, YAWS),
+    tuning=TUNINGS,
+    car=st.sampled_from(list(CARS.values())),
+)
+def test_all_of_it_holds_with_a_gyroscope(measurement, state, tuning, car):
+    """But for the plain law, which has none."""
+    case = take(measurement, state, tuning, car)
+    for check in CHECKS:
+        if check is not it_does_what_the_plain_law_does:
+            check(case)
 
 
 @settings(max_examples=EXAMPLES)
