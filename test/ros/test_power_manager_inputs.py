@@ -12,9 +12,12 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import Float64
 
+from iwm_power_manager.control.monitor import InputMonitor
 from iwm_power_manager.control.record import SIGNAL_NAMES
-from iwm_power_manager.nodes.power_manager_inputs import rate_hz
+from iwm_power_manager.control.thresholds import Thresholds, input_limits
+from iwm_power_manager.nodes.power_manager_inputs import judge, rate_hz
 from iwm_power_manager.ros import messages, qos
+from iwm_power_manager.signals.readings import MotionReading
 
 NAN = math.nan
 #: A busy machine may keep a message for a while: a test of its content must not fail for its age.
@@ -340,6 +343,14 @@ def test_a_car_that_its_own_brakes_hold_against_its_motors_is_told(start_own) ->
 def said_with(pair, text: str) -> str:
     """Lines of the node's log with that text."""
     return "\n".join(line for line in pair.running.text().splitlines() if text in line)
+
+
+def test_what_an_imu_shows_reaches_the_law_each_number_its_own() -> None:
+    monitor = InputMonitor(messages.WHEEL_NAMES, input_limits(Thresholds(), 0.33, by_clock=True))
+    for signal, value in (("yaw_rate", 0.5), ("longitudinal_acceleration", -2.0), ("lateral_acceleration", 7.0)):
+        judge(monitor, MotionReading(0, signal, value), 0)
+    assert (monitor.yaw_rate_radps(0), monitor.acceleration_mps2(0)) == (0.5, -2.0)
+    assert math.isnan(monitor.yaw_rate_radps(200_000_000)), "silent for long"
 
 
 def test_a_rate_is_told_whatever_pause_was_in_between() -> None:
