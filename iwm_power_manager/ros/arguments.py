@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import itertools
 import re
+import shlex
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from iwm_power_manager.command_line import CommandParser
@@ -64,7 +65,7 @@ def parameters_help(specs: Iterable[Spec]) -> str:
 
 
 def check_arguments(
-    node: str, description: str, specs: Iterable[Spec], args: Sequence[str] | None, *, examples: str
+    node: str, description: str, specs: Sequence[Spec], args: Sequence[str] | None, *, examples: str
 ) -> None:
     """Show help if it is asked for; refuse what is neither ROS's nor help. Both end the program.
 
@@ -91,6 +92,8 @@ def check_arguments(
     if "--ros-args" not in given and set(given).intersection(("-h", "--help")):
         parser.parse_args(given[1:])
     _check_settings(given)
+    if meant := _without_mark(given, {spec.name for spec in specs}):
+        parser.error(f"what is for ROS has to stand behind --ros-args: {shlex.join([node, *meant])}")
     from rclpy.utilities import remove_ros_args  # which takes its time to be imported
 
     try:
@@ -99,6 +102,22 @@ def check_arguments(
         # rcl adds where in its sources that was noticed.
         raise ParameterError(" ".join(str(error).split(", at ")[0].split())) from None
     parser.parse_args(own)
+
+
+def _without_mark(given: Sequence[str], parameters: Collection[str]) -> list[str]:
+    """How options of ROS are written that stand before `--ros-args`, with all that stands there; [] if none do.
+
+    rcl takes what has a `:=` there for a remapping, as ROS 1 had them: a parameter would have no effect.
+    """
+    end = given.index("--ros-args") if "--ros-args" in given else len(given)
+    words, before = given[1:end], ["", *given[1:end]]
+    meant: list[str] = []
+    for word, option in zip(words, before, strict=False):
+        if ":=" in word and option not in _SETTING:
+            meant.append("-p" if word.partition(":=")[0] in parameters else "-r")
+        meant.append(word)
+    found = any(":=" in word or word in (_PARAMS_FILE, *_SETTING) for word in words)
+    return ["--ros-args", *meant, *given[end + 1 :]] if found else []
 
 
 def _check_settings(given: Sequence[str]) -> None:

@@ -59,10 +59,9 @@ def declare(node: Node, specs: Sequence[Spec]) -> dict[str, Any]:
         except (InvalidParameterTypeException, InvalidParameterValueException, ParameterUninitializedException):
             override = node._parameter_overrides.get(spec.name)  # the exceptions do not all carry the value
             given = override.value if override else None
-            whole = type(given) is int and isinstance(spec.default, float)  # ROS takes no 100 for 100.0
             raise ParameterError(
                 f"parameter {spec.name}: {given!r} is not allowed; "
-                f"allowed: {spec.allowed()} ({_type_name(spec)}{f': write {given}.0' if whole else ''})"
+                f"allowed: {spec.allowed()} ({_type_name(spec)}{_with_points(spec, given)})"
             ) from None
         problem = spec.problem(value)
         if problem:
@@ -70,6 +69,17 @@ def declare(node: Node, specs: Sequence[Spec]) -> dict[str, Any]:
         values[spec.name] = _plain(value)
     _refuse_unknown(node, specs)
     return values
+
+
+def _with_points(spec: Spec, given: Any) -> str:
+    """How allowed whole numbers are written: ROS takes no 100 for 100.0."""
+    several = isinstance(spec.default, list)
+    ours: Any
+    ours, theirs = (spec.default, given) if several and isinstance(given, Sequence) else ([spec.default], [given])
+    if {*map(type, ours)} != {float} or {*map(type, theirs)} != {int}:
+        return ""
+    value = [float(number) for number in theirs] if several else float(given)
+    return "" if spec.problem(value) else f": write {value}"
 
 
 def _refuse_unknown(node: Node, specs: Sequence[Spec]) -> None:

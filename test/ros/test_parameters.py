@@ -239,6 +239,21 @@ def test_a_setting_that_ros_cannot_read_is_answered_with_how_it_is_written(given
     assert words in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("given", "right"),
+    [
+        (["-p", "mode:=b"], "-p mode:=b"),
+        (["mode:=b", "--ros-args", "-r", "a:=b"], "-p mode:=b -r a:=b"),
+        (["__ns:=/car_1"], "-r __ns:=/car_1"),
+        (["--params-file", "my car.yaml"], "--params-file 'my car.yaml'"),
+    ],
+)
+def test_what_is_for_ros_without_its_mark_is_answered_with_how_it_is_written(given, right, capsys) -> None:
+    with pytest.raises(SystemExit):
+        check_arguments("node", "", list(SPECS.values()), ["node", *given], examples="")
+    assert f"has to stand behind --ros-args: node --ros-args {right} (see" in capsys.readouterr().err
+
+
 def test_settings_that_ros_can_read_are_left_to_it() -> None:
     right = ["-p", "policy_file:=''", "-r", "__ns:=/car_1", "--remap", "a:=b"]
     check_arguments("node", "", [], ["node", "--ros-args", *right], examples="")
