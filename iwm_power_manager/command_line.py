@@ -7,6 +7,7 @@ import argparse
 import re
 import sys
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 from iwm_power_manager.errors import ConfigError, did_you_mean, spelled_like
@@ -21,7 +22,13 @@ class CommandParser(argparse.ArgumentParser):
 
     Options are written in full, so that `given` of what it has parsed holds the names of those that were given;
     `--no-x`, the other side of `--x`, is `--x` there.
+
+    Attributes
+    ----------
+    meanings : what choices are, in half a sentence, for those who chose something else
     """
+
+    meanings: Mapping[str, str] = MappingProxyType({})
 
     def __init__(self, prog: str, **settings: Any) -> None:
         settings.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
@@ -49,7 +56,12 @@ class CommandParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and where help is."""
         if choice := _CHOICE.search(message):
-            message += did_you_mean(spelled_like(choice["given"], re.findall("'([^']*)'", choice["known"])))
+            given, known = choice["given"], re.findall("'([^']*)'", choice["known"])
+            near = spelled_like(given, known)
+            near = near or [name for name in known if given in re.split(r"\W+", self.meanings.get(name, ""))]
+            message += did_you_mean(
+                f"{name} ({self.meanings[name]})" if name in self.meanings else name for name in near
+            )
         self.exit(BAD_INPUT, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ MAX_MESSAGE = 1000
 _MAX_PROBLEM = 300
 #: How much alike names have to be, 0..1, for one to be taken for a slip of the other.
 _NEAR = 0.7
+_WORD_ENDS = re.compile(r"[\W_]+")
 
 
 def one_line(text: str, limit: int = MAX_MESSAGE) -> str:
@@ -26,9 +28,14 @@ def one_line(text: str, limit: int = MAX_MESSAGE) -> str:
 
 
 def spelled_like(given: str, known: Iterable[str]) -> list[str]:
-    """Up to three of the known names that `given` may be a slip of, capitals or not, the likest first."""
+    """Up to three of the known names that `given` may be a slip of, capitals or not, or a whole word of.
+
+    The likest stand first, then those of the fewest letters.
+    """
     names = {name.lower(): name for name in known}
-    return [names[near] for near in difflib.get_close_matches(given.lower(), list(names), 3, _NEAR)]
+    near = difflib.get_close_matches(given.lower(), list(names), 3, _NEAR)
+    with_it = [name for name in sorted(names, key=len) if given.lower() in _WORD_ENDS.split(name)]
+    return [names[name] for name in dict.fromkeys([*near, *with_it])][:3]
 
 
 def did_you_mean(names: Iterable[str]) -> str:

@@ -17,6 +17,7 @@ def parser():
     made.add_argument("--record", action=BooleanOptionalAction)
     made.add_argument("--no-page", action="store_true")
     made.add_argument("--strategy", choices=["sdp", "sdp_lookahead", "equal"])
+    made.meanings = {"sdp": "its table", "equal": "the paper's ED"}
     made.add_subparsers(dest="what").add_parser("all").add_argument("--many", type=int)
     return made
 
@@ -30,6 +31,9 @@ def parser():
         (["--plo=a.png"], "unrecognized arguments: --plo=a.png; did you mean --plot?", "draw"),
         (["all", "--mny", "3"], "unrecognized arguments: --mny 3; did you mean --many?", "draw all"),
         (["--strategy", "sdp_lookahed"], "'sdp_lookahead', 'equal'); did you mean sdp_lookahead?", "draw"),
+        (["--strategy", "SDP"], "; did you mean sdp (its table) or sdp_lookahead?", "draw"),
+        (["--strategy", "lookahead"], "; did you mean sdp_lookahead?", "draw"),
+        (["--strategy", "ED"], "; did you mean equal (the paper's ED)?", "draw"),
         (["--strategy", "magic"], "'magic' (choose from 'sdp', 'sdp_lookahead', 'equal') (see", "draw"),
         (["al"], "did you mean all?", "draw"),
         (["all", "--many", "x"], "invalid int value: 'x'", "draw all"),

@@ -20,7 +20,7 @@ from iwm_power_manager.exit_codes import DONE, INTERRUPTED
 from iwm_power_manager.files import atomic_write
 
 
-def described(name: str, description: str, examples: str) -> argparse.ArgumentParser:
+def described(name: str, description: str, examples: str) -> CommandParser:
     """Parser of a command, with `--version` and examples as typed."""
     parser = CommandParser(name, description=description, epilog=examples)
     parser.add_argument("--version", action="version", version=f"{name} {__version__}")

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from iwm_power_manager.command_line import refuse_without_effect
 from iwm_power_manager.control import settings as law_settings
-from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES
+from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES, meaning
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.tools.command import described, ended, output_file, picture
 from iwm_power_manager.tools.options import add_setting, number, several, whole
@@ -83,6 +83,8 @@ MODES = {
 def parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
     result = described("evaluate", _DESCRIPTION, _EXAMPLES)
+    variants = {name: variant.meaning for name, variant in VARIANTS.items()}
+    result.meanings = {name: meaning(name) for name in STRATEGIES} | variants
     _add_cases(result.add_argument_group("cases (all combinations are driven)"))
     _add_policies(result.add_argument_group("policies (sdp, sdp_lookahead; preview takes its budget from them)"))
     _add_law(result.add_argument_group("control law"))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 
 from iwm_power_manager.control.strategy import Strategy
 
@@ -50,6 +51,16 @@ def seal() -> tuple[Strategy, ...]:
 def name_of(code: int) -> str:
     """Name of a strategy's code."""
     return next(strategy.name for strategy in STRATEGIES.values() if strategy.code == code)
+
+
+def meaning(name: str) -> str:
+    """What a strategy does, in half a sentence: the first line of its file, behind its name."""
+    return (
+        (sys.modules[STRATEGIES[name].choose.__module__].__doc__ or "")
+        .partition("\n")[0]
+        .partition(": ")[2]
+        .rstrip(".")
+    )
 
 
 def drivable() -> tuple[str, ...]:
