@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import json
 import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -29,6 +30,20 @@ def cell(cycle: str, friction: float) -> dict[str, float]:
     """Printed ΔSoC of ED, GRDP and SDP, and the printed saving, %."""
     result: dict[str, float] = printed()["delta_soc_percent"][f"{friction:g}"][cycle]
     return result
+
+
+def as_printed(table: int, cycles: Sequence[str]) -> list[dict[str, Any]]:
+    """Rows of one of the paper's tables, 3 to 6, for those of these cycles that it has."""
+    known = [cycle for cycle in cycles if cycle in CYCLES]
+    if table not in TABLES.values():
+        return [{"cycle": cycle, **printed()["table_6"][cycle]} for cycle in known]
+    (friction,) = (friction for friction, number in TABLES.items() if number == table)
+    rows = []
+    for cycle in known:
+        depleted = dict(cell(cycle, friction))
+        saving = depleted.pop("saving")
+        rows.append({"cycle": cycle, "friction": friction, "delta_soc_percent": depleted, "saving_percent": saving})
+    return rows
 
 
 @dataclass(frozen=True)

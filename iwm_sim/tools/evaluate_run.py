@@ -201,8 +201,7 @@ def _study(options: argparse.Namespace) -> None:
 def _paper(options: argparse.Namespace) -> None:
     cycles = list(dict.fromkeys(options.cycle or paper.CYCLES))
     idle_drives = list(dict.fromkeys(options.idle_drive or ("none", "drag")))
-    for cycle in cycles:
-        cases.cycle_of(cycle)
+    names = [cases.cycle_of(cycle).name for cycle in cycles]
     policies = Policies(options.vehicle, options.policy, options.say)
     tables = single.paper_table(options.paper, policies, cycles, idle_drives, options.jobs, options.quiet)
     if not options.quiet:
@@ -212,7 +211,9 @@ def _paper(options: argparse.Namespace) -> None:
         print(f"{textwrap.fill(table.note, screen())}\n{_policies_text(policies)}")
     if options.json:
         rows = [row for table in tables for cell in table.rows for row in cell.values()]
-        write_json(options.json, {"package_version": __version__, "table": options.paper, "rows": rows})
+        printed = paper.as_printed(int(options.paper), names)
+        content = {"package_version": __version__, "table": options.paper, "printed": printed, "rows": rows}
+        write_json(options.json, content)
 
 
 def _policies_text(policies: Policies) -> str:

@@ -12,7 +12,7 @@ import pytest
 
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
-from iwm_sim.study import unseen, variants
+from iwm_sim.study import single, unseen, variants
 from iwm_sim.study.content import Study
 from iwm_sim.study.frontier import Frontier, Point
 from iwm_sim.tools import evaluate
@@ -192,6 +192,40 @@ def test_a_figure_without_a_result_is_refused_with_what_it_shows(name, words, ca
 def test_a_figure_needs_a_file(capsys):
     assert evaluate.main(["--figure", "9"]) == 2
     assert "--plot: is missing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("SDP", "did you mean sdp (the share of the solved policy, looked up in its table) or paper_sdp (the paper's"),
+        ("GRDP", "did you mean rule (a straight line"),
+    ],
+)
+def test_a_strategy_by_the_papers_name_is_answered_with_those_it_may_be_and_what_they_are(given, words, capsys):
+    with pytest.raises(SystemExit):
+        evaluate.main(["--cycle", "nycc", "--strategy", given])
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("table", "printed"),
+    [
+        (
+            "5",
+            {
+                "cycle": "nycc",
+                "friction": 0.2,
+                "delta_soc_percent": {"ED": 3.41, "GRDP": 3.4, "SDP": 2.64},
+                "saving_percent": 22.58,
+            },
+        ),
+        ("6", {"cycle": "nycc", "SDP": 1.58, "with_skid_avoidance": 0.32}),
+    ],
+)
+def test_the_json_of_a_table_of_the_paper_has_what_the_paper_prints(table, printed, hill, monkeypatch, capsys):
+    monkeypatch.setattr(single, "paper_table", lambda *_: [])
+    assert evaluate.main(["--paper", table, "--cycle", "nycc", str(hill), "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["printed"] == [printed]
 
 
 @pytest.mark.nightly
