@@ -57,24 +57,77 @@ def keeps_slip(braking, wheel, m, settings, vehicle):
     return wheel.grip < little and abs(wheel.road) < little and slipped > 0.02 * m.speed_mps + 0.1
 
 
-def slip_targets(state, settings, braking):
-    """Slip the limiter steers each wheel to: less while left and right are braked unequally."""
+def yaw_speed_factor(speed, settings):
+    """What the speed makes of a yaw budget."""
+    return min(settings.yaw_speed_mps / max(speed, 0.06), 2.0) ** 2
+
+
+def known_yaw(m, state, settings):
+    """What is remembered of the yaw rate: what it was before, whether it is believed, and what it adds."""
+    was, unequal, rate, dt = state.yaw, state.front_unequal_s, m.yaw_rate_radps, m.dt_s
+    growth = settings.yaw_rate_growth_nmps * yaw_speed_factor(m.speed_mps, settings)
+    alike = -0.03 <= unequal <= 0.03
+    unknown = was._replace(
+        straight_radps=0.0, known_s=0.0, shown_radps=0.0, same_s=0.0, turned_rad=0.0, believed=False, towards_radps=0.0
+    )
+    faded = 0.0 if alike else max(0.0, was.extra_nm - dt * growth)
+    if rate != rate or growth == 0.0:
+        return unknown._replace(extra_nm=faded)
+    if alike:
+        heard = min(was.known_s, 0.5)
+        mean = (heard * was.straight_radps + dt * rate) / (heard + dt)
+        return unknown._replace(straight_radps=mean, known_s=was.known_s + dt, shown_radps=rate, extra_nm=0.0)
+    towards = rate - was.straight_radps if unequal > 0.0 else was.straight_radps - rate
+    now = was._replace(
+        shown_radps=rate,
+        same_s=was.same_s + dt if rate == was.shown_radps else 0.0,
+        turned_rad=was.turned_rad + dt * towards,
+        towards_radps=towards,
+        extra_nm=faded,
+    )
+    if now.same_s > 0.1 or now.turned_rad < -0.15:
+        now = now._replace(known_s=0.0)
+    turned_at_first = -1.0 <= unequal <= 1.0 and now.turned_rad > 0.004
+    now = now._replace(believed=now.known_s >= 0.25 and (was.believed or turned_at_first))
+    if now.believed and m.power_demand_w < 0.0:
+        calm = (0.03 - towards) / 0.03 if towards > 0.0 else 1.0
+        now = now._replace(extra_nm=min(1500.0, max(0.0, was.extra_nm + dt * growth * calm)))
+    return now
+
+
+def slip_targets(state, settings, braking, believed):
+    """Slip the limiter steers each wheel to: less while left and right are braked unequally.
+
+    Less of that where a yaw rate is believed.
+    """
     unequal = state.front_unequal_s
     if not braking or -0.03 <= unequal <= 0.03:
         return [settings.slip_target] * 4
-    front = [settings.unequal_slip_target, settings.unequal_low_slip_target]
+    high, rear = settings.unequal_slip_target, settings.unequal_rear_slip_target
+    if believed:
+        high, rear = max(high, 0.1), max(rear, 0.06)
+    front = [high, settings.unequal_low_slip_target]
     front = front if unequal > 0.0 else front[::-1]
-    return [min(target, settings.slip_target) for target in (*front, *[settings.unequal_rear_slip_target] * 2)]
+    return [min(target, settings.slip_target) for target in (*front, rear, rear)]
 
 
-def yaw_budget(name, state, settings, speed, braking):
-    """Yaw moment that more torque left may have, and more torque right."""
+def yaw_budget(name, state, settings, speed, braking, yaw):
+    """Yaw moment that more torque left may have, and more torque right; `yaw` is what is known of the yaw rate."""
     now, growth, most = (getattr(settings, f"{name}_yaw_{part}") for part in ("nm", "growth_nmps", "most_nm"))
     if not braking:
         return [most, most]
-    factor = min(settings.yaw_speed_mps / max(speed, 0.06), 2.0) ** 2
-    unequal = getattr(state, f"{name}_unequal_s")
-    return [min(factor * (now + growth * max(side * unequal, 0.0)), most) for side in (1.0, -1.0)]
+    factor = yaw_speed_factor(speed, settings)
+    unequal, lasting = getattr(state, f"{name}_unequal_s"), state.front_unequal_s
+    added = yaw.extra_nm - (16000.0 * max(yaw.towards_radps, 0.0) if yaw.believed else 0.0)
+    if name == "rear":
+        added = 0.3 * max(added, 0.0)
+    return [
+        max(
+            min(factor * (now + growth * max(side * unequal, 0.0)), most) + (added if side * lasting > 0.03 else 0.0),
+            0.0,
+        )
+        for side in (1.0, -1.0)
+    ]
 
 
 def battery_factor(torques, speeds, discharge, charge, motors):
@@ -164,7 +217,8 @@ def step(m, state, settings, vehicle, decide):
     first = state.steps == 0
     braking = m.power_demand_w < 0.0
     bits = set()
-    targets = slip_targets(state, settings, braking)
+    yaw = known_yaw(m, state, settings)
+    targets = slip_targets(state, settings, braking, yaw.believed)
     standing = braking and m.speed_mps < settings.slip_speed_floor_mps
     wheels = [
         Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i], targets[i])
@@ -174,7 +228,7 @@ def step(m, state, settings, vehicle, decide):
         Pair(
             wheels[k : k + 2],
             getattr(state, f"{name}_unequal_s"),
-            yaw_budget(name, state, settings, m.speed_mps, braking),
+            yaw_budget(name, state, settings, m.speed_mps, braking, yaw),
         )
         for k, name in ((0, "front"), (2, "rear"))
     ]
