@@ -505,7 +505,7 @@ class PolicyBank:
 
     def __init__(self, path: str, rule: Sequence[float], vehicle: Vehicle, why_none: str = "") -> None:
         self._path = path
-        self._why_none = why_none or "the strategy needs a policy; name one with --policy"
+        self._why_none = why_none or "name one with --policy"
         self._rule = tuple(rule)
         self._vehicle = vehicle
         self._bank: list[Policy] = []
@@ -523,7 +523,7 @@ class PolicyBank:
         if not STRATEGIES[name_of(strategy)].needs_policy:
             return self._empty
         if not self._path:
-            raise PolicyError(self._why_none)
+            raise PolicyError(f"strategy {name_of(strategy)} needs a policy: {self._why_none}")
         self._bank = self._bank or load_policy_bank(resolve(self._path), self._vehicle)
         policy = choose(self._bank, friction)
         if policy.checksum not in self._tables:

@@ -5,13 +5,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import PurePath
 from typing import Any, NamedTuple
 
 from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.settings import DEFAULTS, Settings
 from iwm_power_manager.control.types import WHEEL_NAMES
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import content_sha256
 from iwm_power_manager.policy import PolicyBank
 from iwm_power_manager.share import resolve, roots, share_path
 from iwm_power_manager.signals.mapping import DEFAULT_MAPPING, SignalMapping, load_mapping
@@ -95,8 +98,11 @@ def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
         for kind, given in (("vehicle", choice.vehicle), ("policy", choice.policy), ("mapping", choice.mapping))
         if given is None and (name := str(recorded.get(_FILES[kind], ""))) and not _packaged(name)
     }
-    files = ", ".join(f"{option} {name[:200]!r}" for option, name in missing.items())
-    ask = f"give the files that the drive was recorded with, or others: {files}"
+    files = ", ".join(f"{option} {name[:200]!r}{_sha256(option, custom_data)}" for option, name in missing.items())
+    ask = (
+        f"give the files that the drive was recorded with, or others: {files} (a file that a bag names is opened by "
+        "itself only where it came with this package)"
+    )
     if "--vehicle" in missing:
         raise ConfigError("arguments", "", ask)
     vehicle_file = choice.vehicle or _packaged(recorded.get("vehicle_file")) or DEFAULT_VEHICLE
@@ -114,6 +120,11 @@ def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
     if problem:
         raise ConfigError("--set", *problem.split(": ", 1))
     policy = choice.policy if choice.policy is not None else _packaged(recorded.get("policy_file", DEFAULT_POLICY))
+    notes = [f"commands and brakes are taken as in {DEFAULT_MAPPING}; {ask}"] if "--mapping" in missing else []
+    inside = _recorded_in(choice, recorded, custom_data)
+    if inside:
+        notes.append(f"of {policy}, {inside} is taken, as recorded; with --friction all of them count")
+        policy = str(resolve(policy) / inside)
     return Plan(
         vehicle,
         PolicyBank(policy, _numbers(recorded.get("rule")), vehicle, ask if "--policy" in missing else ""),
@@ -123,8 +134,29 @@ def make_plan(choice: Choice, custom_data: Mapping[str, str]) -> Plan:
         choice.friction is None,
         1.0 / _number(recorded, "rate_hz", DEFAULT_RATE_HZ),
         mapping,
-        (f"commands and brakes are taken as in {DEFAULT_MAPPING}; {ask}",) if "--mapping" in missing else (),
+        tuple(notes),
     )
+
+
+def _sha256(option: str, custom_data: Mapping[str, str]) -> str:
+    """The beginning of the recorded SHA-256 of an option's file, in brackets, if there is one."""
+    recorded = custom_data.get(f"{option.removeprefix('--')}_sha256", "")
+    return f" (SHA-256 {recorded[:12]})" if recorded else ""
+
+
+def _recorded_in(choice: Choice, recorded: Mapping[str, Any], custom_data: Mapping[str, str]) -> str:
+    """Name of the policy file of the drive in the folder that the user gives, "" if it is not there.
+
+    By its hash where that is recorded, else by its name. Not for another friction, which another policy is for.
+    """
+    name = PurePath(str(recorded.get("policy_file", ""))).name
+    if choice.policy is None or choice.friction is not None or not name.endswith(".npz"):
+        return ""
+    folder = resolve(choice.policy)
+    files = sorted(folder.glob("*.npz")) if os.path.isdir(folder) else []
+    wanted = custom_data.get("policy_sha256", "")
+    same = [file.name for file in files if (content_sha256(file) == wanted if wanted else file.name == name)]
+    return name if name in same else "".join(same[:1])
 
 
 def recorded_mapping(chosen: str | None, custom_data: Mapping[str, str]) -> SignalMapping:

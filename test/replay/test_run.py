@@ -249,6 +249,46 @@ def test_another_policy_that_decides_the_same_is_named(tmp_path: Path, capsys: p
     assert "the policy is not the one that was recorded" in capsys.readouterr().out
 
 
+def test_a_drive_with_a_policy_of_ones_own_says_which_and_finds_it_in_a_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A bag names files but opens none: it may choose among those that the user gives."""
+    policies = tmp_path / "mine"
+    policies.mkdir()
+    policy = load_policy(share_path(f"policies/{POLICY}"))
+    driven = dataclasses.replace(policy, front_share=np.clip(policy.front_share + 0.01, 0.0, 1.0))
+    save_policy(policy, policies / "a.npz")  # of the same friction: no bank holds both
+    save_policy(driven, policies / "b.npz")
+    sha256 = content_sha256(policies / "b.npz")
+    drive = str(ScriptedDrive("sdp", policies / "b.npz").write(tmp_path / "drive", COUNT, policy_sha256=sha256))
+    assert main([drive, "--compare"]) == BAD_INPUT
+    error = capsys.readouterr().err
+    assert "strategy sdp needs a policy" in error
+    assert f"--policy '{policies / 'b.npz'}' (SHA-256 {sha256[:12]}) (a file that a bag names is opened" in error
+    assert main([drive, "--compare", "--policy", str(policies)]) == DONE
+    assert f"of {policies}, b.npz is taken, as recorded" in capsys.readouterr().out
+    (policies / "b.npz").rename(policies / "c.npz")  # another name, the same content
+    assert main([drive, "--compare", "--policy", str(policies)]) == DONE
+    (policies / "a.npz").rename(policies / "b.npz")  # the name of the one, the content of another
+    assert main([drive, "--compare", "--policy", str(policies)]) == DONE
+    assert "c.npz is taken" in capsys.readouterr().out
+    assert main([drive, "--compare", "--policy", str(policies), "--friction", "0.9"]) == BAD_INPUT
+    assert "is for friction 0.9, as is b.npz" in capsys.readouterr().err
+
+
+def test_a_recorded_policy_of_unknown_hash_is_known_by_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policies = tmp_path / "mine"
+    policies.mkdir()
+    policy = load_policy(share_path(f"policies/{POLICY}"))
+    save_policy(policy, policies / "a.npz")
+    drive = str(ScriptedDrive("sdp", policies / "a.npz").write(tmp_path / "drive", 20))
+    save_policy(policy, policies / "b.npz")
+    assert main([drive, "--compare", "--policy", str(policies)]) == DONE
+    assert "a.npz is taken, as recorded" in capsys.readouterr().out
+
+
 def test_a_difference_within_the_tolerance_is_none(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(drive), "--compare", "--set", "slew_up_nmps=1599", "--tolerance", "1e9"]) == DONE
     assert "/wheel_torque_command" in capsys.readouterr().out
@@ -634,7 +674,7 @@ def test_energy_of_a_constant_step_is_power_times_time(drive: Path) -> None:
         (["{drive}", "--strategy", "best"], "--strategy: strategy: 'best' is not allowed; allowed: equal | "),
         (["{drive}", "--strategy", "preview"], "--strategy: strategy: 'preview' is not allowed"),
         (["{drive}", "--strategy", "sdp", "--policy", "/none.npz"], "/none.npz"),
-        (["{drive}", "--strategy", "sdp", "--policy", ""], "the strategy needs a policy"),
+        (["{drive}", "--strategy", "sdp", "--policy", ""], "strategy sdp needs a policy: name one with --policy"),
         (["{drive}", "--set", "gain=1"], "--set: gain: is no setting of the law; allowed: strategy, decision_period_s"),
         (["{drive}", "--set", "critical_slip=x"], "--set: critical_slip"),
         (["{drive}", "--set", "gate_mode=x"], "--set: gate_mode: 'x' is not allowed; allowed: off | table2 | limiter"),
