@@ -17,9 +17,15 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.control.record import measurement_of
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.model.motor import electrical_power_w
+from iwm_power_manager.replay.plan import Choice, make_plan
+from iwm_power_manager.replay.run import Replay
+from iwm_power_manager.replay.what_if import what_if
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim import closed_loop
@@ -170,6 +176,26 @@ def test_the_page_shows_the_whole_drive(finished) -> None:
     ]
     assert data["time"][-1] == pytest.approx(STEPS * 0.02, abs=0.1)
     assert "✓ valid" in page
+
+
+def test_what_replay_estimates_of_the_drive_differs_from_the_simulation_by_what_the_page_says(finished, alone) -> None:
+    """docs/bags.md, What if: the law's battery, and speeds at the beginning of each step."""
+    with BagReader(finished.folder / "bag") as bag:
+        plan = make_plan(Choice(), bag.custom_data)
+        recorded = what_if(bag, [(STRATEGY, plan)])[0][0]
+        steps = [step for _, steps in Replay(bag, plan).steps() for step in steps]
+    books = alone.final.energies
+    assert recorded.chemical_wh == pytest.approx(books.chemical_j / 3600.0, rel=0.01)
+    assert recorded.chemical_wh - recorded.electrical_wh > (books.ohmic_j + books.polarisation_j) / 3600.0
+    speeds = np.array([measurement_of(step.values).wheel_speed_radps for step in steps])
+    middle = np.vstack([(speeds[1:] + speeds[:-1]) / 2.0, speeds[-1:]])
+    motors = [plan.vehicle.params.front.motor] * 2 + [plan.vehicle.params.rear.motor] * 2
+    joules = 0.02 * sum(
+        electrical_power_w(torque, speed, motor)
+        for step, at in zip(steps, middle, strict=True)
+        for torque, speed, motor in zip(step.command.motor_torque_nm, at, motors, strict=True)
+    )
+    assert joules == pytest.approx(books.chemical_j - books.ohmic_j - books.polarisation_j, rel=5e-4)
 
 
 def test_it_refuses_to_write_over_another_run(finished) -> None:
