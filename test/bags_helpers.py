@@ -35,6 +35,7 @@ from iwm_power_manager.vehicle import load_vehicle
 FLOAT64 = "std_msgs/msg/Float64"
 TWIST = "geometry_msgs/msg/TwistStamped"
 BATTERY = "sensor_msgs/msg/BatteryState"
+IMU = "sensor_msgs/msg/Imu"
 FRICTION = 0.9
 
 
@@ -57,11 +58,15 @@ class ScriptedDrive:
     ----------
     strategy : of the law
     policy_file : file or folder of policies, for strategies that need one
+    moving : the bag has an IMU, silent for a while, and a direction, in which the car goes backwards for a while
     """
 
     DT_NS = 10_000_000
 
-    def __init__(self, strategy: str = "instantaneous_slip", policy_file: Path | None = None) -> None:
+    def __init__(
+        self, strategy: str = "instantaneous_slip", policy_file: Path | None = None, moving: bool = False
+    ) -> None:
+        self.moving = moving
         self.vehicle = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"))
         # No price for a change of the share: so that the strategy does something in a second.
         self.parameters: dict[str, str | float] = {"strategy": strategy, "switching_power_w": 0.0}
@@ -83,6 +88,14 @@ class ScriptedDrive:
         slip = 0.002 * demand / 1e3
         return speed, [speed / 0.33 * (1.0 + slip * k) for k in (1.0, 1.1, 0.9, 1.0)], demand
 
+    def motion(self, i: int) -> tuple[float, float] | None:
+        """Yaw rate and acceleration of step `i`; None where the IMU is silent."""
+        return None if 30 <= i < 60 else (0.05 * math.sin(0.1 * i), 4.0 * math.cos(0.02 * i))
+
+    def direction(self, i: int) -> float:
+        """Direction asked for in step `i`."""
+        return -1.0 if 80 <= i < 110 else 1.0
+
     def write(
         self,
         path: Path,
@@ -102,12 +115,21 @@ class ScriptedDrive:
             wheel_topic = bag.add_topic(topic("/wheel_states", JOINT_STATE))
             battery_topic = bag.add_topic(topic("/battery_state", BATTERY))
             demand_topic = bag.add_topic(topic("/power_demand"))
+            moving = [bag.add_topic(topic("/imu", IMU)), bag.add_topic(topic("/direction"))] if self.moving else []
             names = (WHEEL_TORQUE_COMMAND, FRICTION_BRAKE_COMMAND, POWER_MANAGER_STATE)
             outputs = [bag.add_topic(topic(f"/{name}", JOINT_STATE)) for name in names] if commands or state else []
             for i in range(start, start + count):
                 now = (i + 1) * self.DT_NS
                 speed, wheels, demand = self.inputs(i)
                 log = now
+                shown = self.motion(i)
+                if self.moving:
+                    bag.write(moving[1], log, float64(self.direction(i)), log, i + 1)
+                    self.controller.monitor.direction = self.direction(i)
+                if self.moving and shown:
+                    bag.write(moving[0], log, imu(now, *shown), log, i + 1)
+                    self.controller.monitor.take_yaw_rate(shown[0], now)
+                    self.controller.monitor.take_acceleration(shown[1], now)
                 for number, data in (
                     (speed_topic, twist(now, speed)),
                     (wheel_topic, wheel_states(now, wheels)),
@@ -136,6 +158,18 @@ class ScriptedDrive:
 def twist(stamp_ns: int, speed_mps: float) -> bytes:
     """CDR of a TwistStamped."""
     return b"\0\1\0\0" + struct.pack("<iII4x6d", stamp_ns // 10**9, stamp_ns % 10**9, 1, speed_mps, 0, 0, 0, 0, 0)
+
+
+def imu(stamp_ns: int, yaw_rate_radps: float, forward_mps2: float) -> bytes:
+    """CDR of an Imu."""
+    types = standard_types().types
+    stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="base_link")
+    level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    vector, nothing = types["geometry_msgs/msg/Vector3"], np.zeros(9)
+    turning, pushing = vector(0.0, 0.0, yaw_rate_radps), vector(forward_mps2, 0.0, 9.81)
+    message = types[IMU](header, level, nothing, turning, nothing, pushing, nothing)
+    return bytes(standard_types().serialize_cdr(message, IMU))
 
 
 def battery(stamp_ns: int, soc: float, temperature_c: float = 25.0) -> bytes:

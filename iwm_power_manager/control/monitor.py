@@ -362,6 +362,13 @@ class InputMonitor:
         reported, self.motor_torque_nm = self.motor_torque_nm, None
         return reported
 
+    def take_motion(self, signal: str, value: float, now_ns: int) -> None:
+        """Keep a signal of the car's motion that the law uses."""
+        if signal == "longitudinal_acceleration":
+            self.take_acceleration(value, now_ns)
+        elif signal == "yaw_rate":
+            self.take_yaw_rate(value, now_ns)
+
     def take_acceleration(self, acceleration_mps2: float, now_ns: int) -> None:
         """Keep what an accelerometer shows, forward."""
         if abs(acceleration_mps2) <= _MOST_MPS2:

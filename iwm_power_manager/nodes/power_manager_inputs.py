@@ -217,7 +217,5 @@ def judge(monitor: InputMonitor, reading: Any, now_ns: int) -> None:
         monitor.take_torques(reading, now_ns)
     elif kind is DirectionReading:
         monitor.direction = reading.direction
-    elif kind is MotionReading and reading.signal == "longitudinal_acceleration":
-        monitor.take_acceleration(reading.value, now_ns)
-    elif kind is MotionReading and reading.signal == "yaw_rate":
-        monitor.take_yaw_rate(reading.value, now_ns)
+    elif kind is MotionReading:
+        monitor.take_motion(reading.signal, reading.value, now_ns)

@@ -28,7 +28,13 @@ from iwm_power_manager.replay.plan import Plan
 from iwm_power_manager.replay.recorded import Recorded, SignalStream, check_signals
 from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.contract import WHEEL_NAMES
-from iwm_power_manager.signals.readings import DemandReading, FrictionReading, joint_state_reader
+from iwm_power_manager.signals.readings import (
+    DemandReading,
+    DirectionReading,
+    FrictionReading,
+    MotionReading,
+    joint_state_reader,
+)
 
 #: What each kind of reading is to the controller.
 _TOPICS = {
@@ -272,6 +278,7 @@ class ReconstructedSteps:
         self._in_sets = stream.by_stamp and _in_sets(probe[:_PROBE_VALUES])
         self._wheels = self._again = 0  # wheel speeds, and those of them with the stamp of the one before
         self._wheels_ns = -1
+        self._motion: list[MotionReading] = []  # since the last step: heard when the next one is due, as in the node
         self._came_ns: dict[str, int] = {}  # of each kind of input, by the log
         self._old: Counter[str] = Counter()  # wheel speeds that came when another input had not come for long
         vehicle = plan.vehicle.params
@@ -347,6 +354,14 @@ class ReconstructedSteps:
                 self._wheels += 1
                 self._again += reading.stamp_ns == self._wheels_ns
                 self._wheels_ns = reading.stamp_ns
+            elif isinstance(reading, MotionReading):
+                self._motion.append(reading)
+            elif isinstance(reading, DirectionReading):
+                self._controller.monitor.direction = reading.direction
+            if topic == (monitor.DEMAND if self._in_sets else monitor.WHEELS):
+                for shown in self._motion:
+                    self._controller.monitor.take_motion(shown.signal, shown.value, self._wheels_ns)
+                self._motion.clear()
             if topic == monitor.FRICTION:
                 self._friction(reading.friction, reading.stamp_ns)
             elif topic is not None:

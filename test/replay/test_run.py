@@ -71,6 +71,44 @@ def test_an_unchanged_law_gives_the_recorded_commands_bit_by_bit(
         assert (entry["compared"], entry["differing"], entry["largest"], entry["first"]) == (COUNT, 0, 0.0, None)
 
 
+@pytest.mark.parametrize("in_sets", [True, False], ids=["in sets", "at each wheel speed"])
+def test_without_a_recorded_state_imu_and_direction_count_as_they_did_in_the_drive(
+    in_sets: bool, tmp_path: Path
+) -> None:
+    drive = ScriptedDrive(STRATEGY, moving=True)
+    driven = drive.write(tmp_path / "driven", COUNT, state=False)
+    mapping = tmp_path / "signals.yaml"
+    imu = "{topic: imu, type: sensor_msgs/msg/Imu, field: "
+    mapping.write_text(
+        share_path("config/signals/standard.yaml")
+        .read_text()
+        .replace(
+            "\ncommands:",
+            f"\n  yaw_rate: {imu}angular_velocity.z, unit: rad/s}}"
+            f"\n  longitudinal_acceleration: {imu}linear_acceleration.x, unit: m/s2}}\ncommands:",
+        )
+    )
+    if in_sets:
+        assert main([str(driven), "--mapping", str(mapping), "--compare"]) == DONE
+    with BagReader(driven) as old, BagWriter(tmp_path / "inputs", custom_data=old.custom_data) as new:
+        left_out = () if in_sets else ("/battery_state",)
+        numbers = {name: new.add_topic(found) for name, found in old.topics.items() if name not in left_out}
+        for log_time_ns, name, data, publish_time_ns, sequence in old.messages():
+            if name in numbers:
+                new.write(numbers[name], log_time_ns, data, publish_time_ns, sequence)
+    with BagReader(tmp_path / "inputs") as bag:
+        replay = Replay(bag, make_plan(Choice(mapping=str(mapping)), bag.custom_data))
+        made = [dict(zip(SIGNAL_NAMES, step.values, strict=True)) for _, steps in replay.steps() for step in steps]
+    assert len(made) == (COUNT if in_sets else COUNT - 1)  # the first wheel speeds came before the first demand
+    heard = 0
+    for i, step in enumerate(made, COUNT - len(made)):
+        heard = i if drive.motion(i) else heard
+        shown = drive.motion(heard) if i - heard <= 10 else None
+        assert (step["gyroscope"], step["accelerometer"]) == (float(shown is not None),) * 2
+        assert (step["yaw_rate_radps"], step["acceleration_mps2"]) == (shown or (0.0, 0.0))
+        assert step["direction"] == drive.direction(i)
+
+
 @pytest.mark.parametrize(
     "change",
     [["--set", "slew_up_nmps=1599"], ["--set", "slip_target=0.01"], ["--strategy", "equal"]],
