@@ -35,6 +35,7 @@ from iwm_power_manager.errors import ConfigError, IwmError, did_you_mean, spelle
 from iwm_power_manager.files import check_number
 from iwm_power_manager.policy import Policy, choose, load_policy, load_policy_bank
 from iwm_power_manager.share import resolve
+from iwm_power_manager.tools.solver_figures import draw_share, share_map
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 from iwm_sim import closed_loop
 from iwm_sim.closed_loop import COLUMNS
@@ -202,44 +203,9 @@ def _check(
         raise ConfigError("settings", "", problem)
 
 
-def share_map(
-    policy: Policy, previous_share: float = 0.5, slip: float = 0.0
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """The front share over demand and speed, both slips and the previous share at their nearest grid points.
-
-    Returns
-    -------
-    demand, W, (P,); speed, m/s, (V,); front share (P, V)
-    """
-    check_number("arguments", "previous_share", previous_share, 0.0, 1.0)
-    check_number("arguments", "slip", slip, -1.0, 1.0)
-    problem = policy.problem
-    at = [
-        int(np.argmin(np.abs(np.asarray(axis) - value)))
-        for axis, value in (
-            (problem.slip_front, slip),
-            (problem.slip_rear, slip),
-            (problem.previous_shares, previous_share),
-        )
-    ]
-    return problem.power_w, problem.speed_mps, policy.front_share[:, :, at[0], at[1], at[2]]
-
-
 def plot_share(policy: Policy, previous_share: float = 0.5, slip: float = 0.0) -> Figure:
-    """A picture of `share_map`."""
-    power_w, speed_mps, share = share_map(policy, previous_share, slip)
+    """A picture of `share_map`, as `solve_policy --plot` has it."""
     with mpl.rc_context({"font.size": 10.0}):
         figure = Figure(figsize=(6.0, 4.0), layout="constrained")
-        axis = figure.subplots()
-        image = axis.pcolormesh(
-            speed_mps, power_w / 1000.0, share, cmap="coolwarm", vmin=0.0, vmax=1.0, shading="nearest", rasterized=True
-        )
-        axis.set_xlabel("Speed, m/s")
-        axis.set_ylabel("Power demand, kW")
-        before = f", previous share {previous_share:g}" if policy.problem.previous_share else ""
-        axis.set_title(
-            f"Grid {policy.problem.name}, friction {policy.friction:g}, idle drive {policy.idle_drive}{before}",
-            fontsize=10.0,
-        )
-        figure.colorbar(image, ax=axis).set_label("Front share")
+        draw_share(figure.subplots(), policy, previous_share, slip)
     return figure
