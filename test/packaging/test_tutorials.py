@@ -21,6 +21,7 @@ def test_every_cell_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     notebook = jupytext.read(ROOT / "docs" / "tutorial" / f"{name}.md")
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # a notebook's kernel chooses its own
     notebooks = tmp_path / "docs" / "tutorial"  # where `jupyter lab` runs what it opens there
     notebooks.mkdir(parents=True)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
