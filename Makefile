@@ -2,6 +2,7 @@
 SHELL := /bin/bash
 MAKEFLAGS += --no-print-directory
 .DEFAULT_GOAL := help
+# A recipe is a command a line, without loops: SIGTERM to make ends the command then, and not only a shell around it.
 
 BIN := .venv/bin
 # Extra arguments, as in `make demo ARGS=--help` or `make test PYTEST_ARGS="-k slip"`.
@@ -23,9 +24,11 @@ test: lint type  ## Linters, types and all tests (20 min)
 ##@ Results
 .PHONY: policies study unseen docs-numbers roads bench bench-peers
 CYCLES := $(foreach cycle,ftp75 hwfet nycc,--cycle config/cycles/$(cycle).csv)
+SOLVE := $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml $(CYCLES) --friction 0.9 0.5 0.2 \
+  --grid coupled --output policies
 policies: setup-run  ## Solve the shipped policies again, the same tables come out (2 min)
-	@for idle in drag none; do $(BIN)/solve_policy --vehicle config/vehicles/jalalmaab_2015.yaml --idle-drive $$idle \
-	  $(CYCLES) --friction 0.9 0.5 0.2 --grid coupled --output policies $(ARGS) || exit $$?; done
+	@$(SOLVE) --idle-drive drag $(ARGS)
+	@$(SOLVE) --idle-drive none $(ARGS)
 
 study: setup-run  ## All tables and figures of the paper, and what beats them (3 min)
 	@$(BIN)/evaluate --study runs/study $(ARGS)
@@ -39,10 +42,15 @@ roads: setup-run  ## Drive the scenarios of real roads: what comes out, beside w
 docs-numbers: setup-run  ## Fill the numbers of README and docs: stored results and commands (5 min; ARGS=--study: seconds)
 	@$(BIN)/python scripts/docs_numbers $(ARGS)
 
+define BENCHMARK
+@echo "== $(1)"
+@$(BIN)/python benchmarks/$(1).py
+
+endef
 bench: bench-peers  ## All that has to be fast, each beside its peer, in one table, then control path and signals (an hour)
-	@mkdir -p runs && $(BIN)/python benchmarks/performance.py --fastsim runs/peers/bin/python --json runs/performance.json $(ARGS)
-	@for name in control_path convergence learning plant signals; do \
-	  echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit $$?; done
+	@mkdir -p runs
+	@$(BIN)/python benchmarks/performance.py --fastsim runs/peers/bin/python --json runs/performance.json $(ARGS)
+	$(foreach name,control_path convergence learning plant signals,$(call BENCHMARK,$(name)))
 
 bench-peers: setup-dev  ## FASTSim in an environment of its own, runs/peers: a peer of benchmarks/performance.py (1 min)
 	@test -x runs/peers/bin/python || $(BIN)/python -m venv runs/peers
