@@ -8,6 +8,7 @@ import dataclasses
 import io
 import json
 import math
+import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -75,13 +76,26 @@ def plain(value: Any, digits: int = 17) -> Any:
     return value
 
 
+def note_replaced(*paths: Path | str) -> None:
+    """Say which of these files are there already, and will not be any more."""
+    there = [str(path) for path in paths if os.path.isfile(path)]
+    if there:
+        print(f"note: replaces {', '.join(there)}", file=sys.stderr)
+
+
+def write_result(path: Path | str, data: bytes) -> None:
+    """Write a file that the user has named, atomically; that it replaces another one is said."""
+    note_replaced(path)
+    atomic_write(path, data)
+
+
 def write_json(path: Path | str, value: Any) -> None:
     """Write a value as JSON (`plain`), atomically; to standard output, where the file is called -."""
     text = json.dumps(plain(value), indent=1)
     if str(path) == "-":
         print(text)
     else:
-        atomic_write(path, (text + "\n").encode())
+        write_result(path, (text + "\n").encode())
 
 
 #: Endings of a picture's name, and what would make its bytes differ from run to run or say who drew it.
@@ -107,4 +121,4 @@ def write_picture(path: Path | str, figure: Any, dpi: int = 150) -> None:
     kind = Path(path).suffix.lower()
     stream = io.BytesIO()
     figure.savefig(stream, format=kind[1:], dpi=dpi, facecolor="white", metadata=PICTURES[kind])
-    atomic_write(path, stream.getvalue())
+    write_result(path, stream.getvalue())

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from iwm_power_manager import __version__
-from iwm_power_manager.files import atomic_write
 from iwm_power_manager.tables import SEPARATORS
 from iwm_power_manager.tools import command
 from iwm_power_manager.tools import options as given
@@ -136,7 +135,7 @@ def _import(options: argparse.Namespace) -> None:
     cycle = to_cycle(log, options.gaps, options.max_gap, options.smooth, options.rate)
     raw = to_cycle(log, options.gaps, options.max_gap, 0.0, 0.0)
     numbers = _numbers(options, log, cycle, raw, vehicle)
-    atomic_write(options.output, cycle_text(cycle, bool(options.grade)).encode())
+    command.write_result(options.output, cycle_text(cycle, bool(options.grade)).encode())
     if not options.quiet:
         print(_text(options, log, numbers))
     invented_m = log.across_gaps_m(options.max_gap) if options.gaps == "bridge" else 0.0

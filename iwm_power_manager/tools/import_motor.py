@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from iwm_power_manager import __version__
 from iwm_power_manager.command_line import refuse_without_effect
-from iwm_power_manager.files import atomic_write
 from iwm_power_manager.tables import SEPARATORS
 from iwm_power_manager.tools import command
 from iwm_power_manager.tools import options as given
@@ -145,7 +144,7 @@ def _import(options: argparse.Namespace) -> None:
         "lacks": lacking,
         "map": str(options.output),
     }
-    atomic_write(options.output, map_text(points).encode())
+    command.write_result(options.output, map_text(points).encode())
     if not options.quiet:
         print(_text(options, found, fit, numbers))
     for line in (*points.doubts, *(f"it lacks {line}" for line in lacking)):

@@ -42,7 +42,7 @@ from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.recorded import read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
-from iwm_power_manager.tools.command import described, ended, output_file, picture, write_json
+from iwm_power_manager.tools.command import described, ended, note_replaced, output_file, picture, write_json
 from iwm_power_manager.tools.options import several
 from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
@@ -170,10 +170,9 @@ def _solve_into(options: argparse.Namespace) -> int:
     say = _silent if options.quiet else print
 
     cycles = [load_cycle(resolve(path)) for path in options.cycle]
-    there = [str(path) for path in paths if os.path.exists(path)]
-    notes = [*vehicle.notes, *([f"replaces {', '.join(there)}"] if there else [])]
-    for line in (*(f"note: {note}" for note in notes), *_doubts(cycles, vehicle, frictions)):
+    for line in (*(f"note: {note}" for note in vehicle.notes), *_doubts(cycles, vehicle, frictions)):
         print(f"solve_policy: {line}", file=sys.stderr)
+    note_replaced(*paths, *filter(None, [options.export_mdp]))
     sources = _sources(options, cycles, problem, vehicle)
     chain = chain_of(problem, sources)
     say(_problem_text(problem, vehicle))

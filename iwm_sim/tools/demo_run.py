@@ -103,6 +103,7 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
     if plan.animate:
         from iwm_sim.study.moving_picture import animate
 
+        command.note_replaced(plan.animate)
         animate(
             run,
             plan.animate,

@@ -26,7 +26,7 @@ from iwm_power_manager.policy import save_policy
 from iwm_power_manager.replay.recorded import read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import load_grid, targets
-from iwm_power_manager.tools.command import described, ended, made_with, output_file, write_json
+from iwm_power_manager.tools.command import described, ended, made_with, note_replaced, output_file, write_json
 from iwm_power_manager.tools.options import several, whole
 from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import load_vehicle
@@ -142,6 +142,7 @@ def _learn(options: argparse.Namespace) -> None:
         if options.drive
         else [recorded_cycle(name, drive) for name, drive in recordings]
     )
+    note_replaced(*paths)
     candidates = candidates_of(problem, options.weights, options.bandwidths)
     roads = []
     for friction, path in zip(frictions, paths, strict=True):
