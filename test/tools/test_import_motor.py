@@ -85,10 +85,10 @@ def test_units_of_both_axes_stand_in_the_corner_of_a_matrix(tmp_path, capsys):
     assert (code, err) == (0, "")
     assert "speeds in rpm, as the header says" in out
     same(tmp_path / "map.csv")
-    code, out, err = run(capsys, table, "--output", tmp_path / "map.csv")
+    code, out, err = run(capsys, table, "--output", tmp_path / "again.csv")
     assert (code, err) == (0, "")
     assert r"torques down: the corner says 'torque_nm\speed_rpm'" in out
-    same(tmp_path / "map.csv")
+    same(tmp_path / "again.csv")
     err = run(capsys, table, "--output", tmp_path / "map.csv", "--down", "speed")[2]
     assert r"although the corner says 'torque_nm\speed_rpm'" in err
 
@@ -212,7 +212,7 @@ def test_speeds_taken_for_torques_are_warned_of(tmp_path, capsys):
     assert code == 0
     assert "torques up to 9000 N m at the motor: --down?" in err
     (tmp_path / "sheet.csv").write_text("Nm" + sheet)
-    code, out, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "map.csv")
+    code, out, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "again.csv")
     assert (code, err) == (0, "")
     assert "torques down: the corner says 'Nm'" in out
 
@@ -224,7 +224,7 @@ def test_a_unit_that_contradicts_the_header_is_warned_of(tmp_path, capsys):
         table.write_text(f"{header},T/Nm,eta\n{rows}")
         err = run(capsys, table, "--output", tmp_path / "map.csv", "--speed-unit", unit, "--quiet")[2]
         assert f"speeds in {unit}, as --speed-unit says, although the header says" in err
-    assert run(capsys, table, "--output", tmp_path / "map.csv", "--quiet")[2] == ""
+    assert run(capsys, table, "--output", tmp_path / "again.csv", "--quiet")[2] == ""
 
 
 @pytest.mark.parametrize(("options", "words"), [((), "outermost points of the table: peak"), (DEMANDS, "of the motor")])
