@@ -112,3 +112,20 @@ def observed(jitter: Jitter, demand_w: float, seconds: float) -> Jitter:
     covariance = jitter.covariance_w2 + weight * (step * jitter.step_w - jitter.covariance_w2)
     gain = lasting_gain(variance, covariance)
     return Jitter(0.0, samples, jitter.taken + 1, step, variance, covariance, gain)
+
+
+@kernel
+def remembered_s(jitter: Jitter) -> float:
+    """For how long the demand has been sampled, s."""
+    return jitter.age_s + (jitter.taken - 1) * SAMPLE_S
+
+
+@kernel
+def demand_ago(jitter: Jitter, demand_w: float, seconds: float) -> float:
+    """The demand some time ago, W, between two samples by interpolation; the present one where none is that old."""
+    position = (seconds - jitter.age_s) / SAMPLE_S
+    k = int(position)
+    if position < 0.0 or k + 1 >= min(jitter.taken, SAMPLES):
+        return demand_w
+    part = position - k
+    return (1.0 - part) * jitter.samples_w[k] + part * jitter.samples_w[k + 1]

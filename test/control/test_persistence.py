@@ -8,7 +8,15 @@ import math
 import numpy as np
 import pytest
 
-from iwm_power_manager.control.persistence import Jitter, held_s, lasting_gain, no_jitter, observed
+from iwm_power_manager.control.persistence import (
+    Jitter,
+    demand_ago,
+    held_s,
+    lasting_gain,
+    no_jitter,
+    observed,
+    remembered_s,
+)
 
 
 def watched(demand_w: np.ndarray, step_s: float = 0.01) -> Jitter:
@@ -56,6 +64,14 @@ def test_the_latest_second_is_remembered_newest_first():
     found = watched(np.arange(3000.0))
     assert found.samples_w == tuple(2990.0 - 10.0 * age for age in range(10))
     assert found.age_s == pytest.approx(0.09)
+
+
+def test_the_demand_some_time_ago_is_that_between_two_samples_and_the_present_one_where_none_is_that_old():
+    found = watched(np.arange(3000.0))  # 1 W each 0.01 s; the latest sample is 0.09 s old
+    assert [demand_ago(found, 2999.0, seconds) for seconds in (0.09, 0.2, 0.95)] == pytest.approx([2990, 2979, 2904])
+    assert demand_ago(found, 2999.0, 0.05) == demand_ago(found, 2999.0, 1.0) == 2999.0
+    assert demand_ago(watched(np.arange(15.0)), 14.0, 0.2) == 14.0
+    assert remembered_s(watched(np.arange(15.0))) == pytest.approx(0.14)
 
 
 def test_without_noise_nothing_is_held_and_with_noise_until_the_signal_is_as_uncertain_as_the_estimate():

@@ -217,6 +217,28 @@ def test_the_lookahead_is_one_step_of_bellman_s_equation(power, speed, front, re
         assert within_rounding(costs, ours, 1e-6)
 
 
+@settings(max_examples=60)
+@given(POWER, POWER, POWER, st.floats(0.0, 30.0), SHARE, st.sampled_from([0.0, 0.05]), st.booleans())
+def test_of_now_and_a_step_of_the_chain_ago_the_mean_counts_and_what_both_ask_for(
+    power, old, older, speed, previous, age, few
+):
+    # A step of 0.1 s, as the samples have.
+    jitter = no_jitter()._replace(samples_w=(old, older, *(9e9,) * 8), taken=1 if few else 4, age_s=age)
+    at = situation(power, speed, previous=previous)._replace(jitter=jitter)
+    earlier_w = None if few else older if age == 0.0 else 0.5 * (old + older)
+    motors_w = full_power_w(speed, CAR)
+
+    def outcome(share):
+        step = step_cost_and_next(power, speed, 0.0, 0.0, share, CAR, TABLE.problem)
+        return step.cost_j, step.speed_mps, step.slip_front, step.slip_rear
+
+    for table in (TABLE, BUDGETED):
+        ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, table)
+        point = (power, speed, 0.0, 0.0)
+        costs = splits.bellman(point, previous, table, outcome, motors_w=motors_w, earlier_w=earlier_w)
+        assert within_rounding(costs, ours, 1e-6)
+
+
 def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_noise_lasts():
     gain, latest, demand = 0.5, (4000.0, 9000.0, 1000.0), 6000.0
     jitter = no_jitter()._replace(samples_w=latest + (0.0,) * 7, taken=3, gain=gain)

@@ -89,31 +89,36 @@ def price_units(move):
     return 0.0 if move == 0.0 else (1.0 + min(abs(move) / 0.25, 1.0) + abs(move)) / 3.0
 
 
-def bellman(point, previous, table, outcome, used=(0.0, 0.0), steps=1.0, motors_w=math.inf):
+def bellman(point, previous, table, outcome, used=(0.0, 0.0), steps=1.0, motors_w=math.inf, earlier_w=None):
     """Cost of each share: step, change, and what follows (eq. 31). `outcome(share)` is the step's (cost, v, f, r).
 
     `used` is what is used of the two buckets of changes: the tables at dearer prices count for more, the more that is.
     `steps` is how many times the step counts. With a budget half of eq. 31 is believed, but for braking with more than
-    the motors have; for the other half the step's cost goes on for 0.6 s.
+    the motors have; for the other half the step's cost goes on for 0.8 s, and what follows is the mean of what follows
+    on this demand and on the earlier one. What is better now and by the whole of eq. 31, on both demands, is believed.
     """
     axes = (table.power_w, table.speed_mps, table.slip_front, table.slip_rear, table.previous_share)
     budget = table.changes_per_min
     tables, level, factor, trust = [table.expected_cost_j, *table.dearer_cost_j], 0.0, 1.0, 1.0
+    powers = [point[0]]
     if budget > 0.0:
         if point[0] > -motors_w:
             trust = 0.5
-            steps += 0.5 * (0.6 / table.problem.dt_s - 1.0)
+            powers += [] if earlier_w is None else [earlier_w]
+            steps += 0.5 * (0.8 / table.problem.dt_s - 1.0)
         full = (max(5.0 * budget, 2.0), max(1.25 * budget, 2.0))
         lasting, minute = (min(of / size, 1.0) for of, size in zip(used, full, strict=True))
         angle = math.pi / 2.0 * min(lasting, 0.99)
         factor = 2.0 ** min(lasting, 0.99) * (1.0 + math.pi / (0.7 * full[0]) * math.tan(angle))
         factor *= math.exp(max(4.0 * minute - 2.0, 0.0))
         level = min(math.log(factor, 3.0), 2.0)
-    costs = {}
+    costs, wholes = {}, {}
     for share in (previous, *table.share):
         cost, speed, front, rear = outcome(share)
-        at = (point[0], speed, front, rear, share)
-        follow_up = np.interp(level, range(len(tables)), [interpolated(axes, each, at) for each in tables])
+        places = [(power, speed, front, rear, share) for power in powers]
+        follows = [[interpolated(axes, each, at) for each in tables] for at in places]
+        follows = [float(np.interp(level, range(len(tables)), each)) for each in follows]
+        follow_up = np.mean(follows)
         move = share - previous
         needed = min(abs(move) / 0.25, 1.0) + min(abs(0.5 - share) / 0.25, 1.0) - 1e-9
         if budget > 0.0 and move != 0.0 and any(of + needed > size for of, size in zip(used, full, strict=True)):
@@ -121,5 +126,12 @@ def bellman(point, previous, table, outcome, used=(0.0, 0.0), steps=1.0, motors_
         units = price_units(move) if budget > 0.0 else abs(move)
         changed = factor * table.switching_cost_j * units + table.switching_fixed_cost_j * (move != 0.0)
         costs.setdefault(share, steps * cost + changed + trust * table.discount * follow_up)
+        wholes.setdefault(share, (cost, changed, [table.discount * each for each in follows]))
+    if len(powers) > 1:
+        cost, _, follows = wholes[previous]
+        for share, (other, changed, others) in wholes.items():
+            worth = cost - other - changed + min(a - b for a, b in zip(follows, others, strict=True))
+            if other < cost:
+                costs[share] = min(costs[share], costs[previous] - worth)
     costs[previous] -= TELLS_APART_W * table.problem.dt_s
     return costs

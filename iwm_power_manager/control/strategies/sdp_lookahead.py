@@ -8,11 +8,10 @@ only, and what is noise of the demand is averaged out (`control.persistence`).
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from iwm_power_manager.control.budget import affordable, price_factor, price_level, price_units
-from iwm_power_manager.control.persistence import SAMPLES, held_s
+from iwm_power_manager.control.persistence import SAMPLES, demand_ago, held_s, remembered_s
 from iwm_power_manager.control.strategies.instantaneous import LEAST_DIFFERENCE_W
 from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import PolicyTable
@@ -28,10 +27,11 @@ if TYPE_CHECKING:
 
 #: Part of the forecast that is believed where changes are budgeted. Changes are made where it is high, and there it is
 #: too high on average: in hindsight they were worth half of it. Braking beyond what the motors can do, what is better
-#: just now is no reason to move brake force about (docs/solver.md).
+#: just now is no reason to move brake force about (docs/solver.md). What has just come up is the likelier too high: the
+#: forecast is the mean of now and a step of the chain ago, and where eq. 31 asks for a change at both, it is believed.
 TRUST = 0.5
 #: For the rest a rule of thumb counts: what is better now stays so for this long, s.
-WORTH_S = 0.6
+WORTH_S = 0.8
 
 Cell = tuple[int, float]  # as `locate` gives it
 
@@ -42,25 +42,38 @@ _ROUNDING = 1e-9
 
 
 class _Ahead(NamedTuple):
-    """What a demand leads to, whatever the share, where slip is settled; the cells it and its end are in."""
+    """What a demand leads to, whatever the share, where slip is settled; the cells it and its end are in.
+
+    `earlier` is the cell of the demand whose forecast counts beside that of this one.
+    """
 
     settled: Settled
     power: Cell
+    earlier: Cell
     speed: Cell
     slip_front: Cell
     slip_rear: Cell
 
 
 @kernel
-def _ahead(power_demand_w: float, situation: Situation, vehicle: VehicleParams, policy: PolicyTable) -> _Ahead:
+def _ahead(
+    power_demand_w: float, earlier_w: float, situation: Situation, vehicle: VehicleParams, policy: PolicyTable
+) -> _Ahead:
     before = settled(power_demand_w, situation.speed_mps, vehicle, policy.problem)
     return _Ahead(
         before,
         locate(policy.power_w, power_demand_w),
+        locate(policy.power_w, earlier_w),
         locate(policy.speed_mps, before.speed_mps),
         locate(policy.slip_front, 0.0),
         locate(policy.slip_rear, 0.0),
     )
+
+
+@kernel
+def _half_believed(power_demand_w: float, situation: Situation, vehicle: VehicleParams, policy: PolicyTable) -> bool:
+    """Whether only a part of the forecast is believed: where changes are budgeted, but in braking beyond the motors."""
+    return policy.changes_per_min > 0.0 and power_demand_w > -full_power_w(situation.speed_mps, vehicle)
 
 
 @kernel
@@ -72,40 +85,73 @@ def _cell_of(k: int, share: float, policy: PolicyTable) -> Cell:
     return locate(axis, share)
 
 
+class _Outlook(NamedTuple):
+    """What a share costs in a step of the chain, and what is forecast to follow, J.
+
+    `later_j` goes by the present demand, `earlier_j` by that of a step ago, where it counts; else they are the same.
+    """
+
+    step_j: float
+    later_j: float
+    earlier_j: float
+
+
 @kernel
 def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, policy: PolicyTable) -> float:
-    """Share that minimises eq. 31, among those whose change the budget can afford."""
+    """Share that minimises eq. 31, as far as it is believed, among those whose change the budget can afford."""
     previous = situation.previous_share
     used = situation.changes_used
     factor = price_factor(used, policy.changes_per_min)
     level = price_level(factor) if policy.dearer_cost_j.shape[0] > 0 else 0.0
     price = factor * policy.switching_cost_j
     budgeted = policy.changes_per_min > 0.0
-    ahead = _ahead(situation.power_demand_w, situation, vehicle, policy)
+    demand_w = situation.power_demand_w
+    gain = situation.jitter.gain
+    half = _half_believed(demand_w, situation, vehicle, policy)
+    steady = half and gain > _LASTING and remembered_s(situation.jitter) >= policy.problem.dt_s
+    earlier_w = demand_ago(situation.jitter, demand_w, policy.problem.dt_s) if steady else demand_w
+    held = held_s(gain) / policy.problem.dt_s if gain <= _LASTING else 0.0
+    trust, steps = 1.0, 1.0 + held
+    if half:
+        trust = TRUST
+        steps = TRUST + (1.0 - TRUST) * WORTH_S / policy.problem.dt_s + held
+    ahead = _ahead(demand_w, earlier_w, situation, vehicle, policy)
     # Each kernel is called in one place, so that the compiler puts it there: a car and a policy are much to pass on.
-    best, best_cost = previous, math.inf
+    best, most = previous, 0.0
+    kept = _Outlook(0.0, 0.0, 0.0)
+    worth = 0.0
     for k in range(-1, policy.share.size):
-        share, switching = previous, -LEAST_DIFFERENCE_W * policy.problem.dt_s
+        share, switching = previous, LEAST_DIFFERENCE_W * policy.problem.dt_s
         if k >= 0:
             share = policy.share[k]
             move = share - previous
             if move == 0.0 or not affordable(share, previous, used, policy.changes_per_min):
                 continue
-            switching = price * (price_units(move) if budgeted else abs(move)) + policy.switching_fixed_cost_j
+            switching += price * (price_units(move) if budgeted else abs(move)) + policy.switching_fixed_cost_j
         cell = _cell_of(k, share, policy)
-        # Most shares are worse for certain than the best so far, before anything is solved for them.
-        for least in (policy.problem.slip_model == SLIP_QUASI_STEADY, False):
-            cost = _cost_j(ahead, situation, share, cell, least, level, vehicle, policy) + switching
-            if cost - _ROUNDING * abs(cost) >= best_cost:
+        # Most shares are worth less than the best so far for certain, before anything is solved for them.
+        for least in (k >= 0 and policy.problem.slip_model == SLIP_QUASI_STEADY, False):
+            found = _outlook(ahead, situation, share, cell, least, level, vehicle, policy)
+            if k < 0:
+                kept = found
                 break
-        if cost < best_cost:
-            best_cost = cost
+            step = kept.step_j - found.step_j
+            later = policy.discount * (kept.later_j - found.later_j)
+            earlier = policy.discount * (kept.earlier_j - found.earlier_j)
+            worth = steps * step + trust * 0.5 * (later + earlier)
+            if steady and step > 0.0:
+                worth = max(worth, step + min(later, earlier))
+            worth -= switching
+            if worth + _ROUNDING * abs(kept.step_j) <= most:
+                break
+        if k >= 0 and worth > most:
+            most = worth
             best = share
     return best
 
 
 @kernel
-def _cost_j(
+def _outlook(
     ahead: _Ahead,
     situation: Situation,
     share: float,
@@ -114,35 +160,30 @@ def _cost_j(
     level: float,
     vehicle: VehicleParams,
     policy: PolicyTable,
-) -> float:
-    """Cost of a step with this share and of all that follows, J, in the mean over what the demand jitters between."""
+) -> _Outlook:
+    """What this share costs, in the mean over what the demand jitters between."""
     gain = situation.jitter.gain
     demand_w = situation.power_demand_w
-    trust, steps = 1.0, 1.0
-    if policy.changes_per_min > 0.0 and demand_w > -full_power_w(situation.speed_mps, vehicle):
-        trust = TRUST
-        steps = TRUST + (1.0 - TRUST) * WORTH_S / policy.problem.dt_s
-    samples = 0
-    if gain <= _LASTING:
-        samples = min(SAMPLES, situation.jitter.taken)
-        steps += held_s(gain) / policy.problem.dt_s
-    total = weights = 0.0
+    samples = min(SAMPLES, situation.jitter.taken) if gain <= _LASTING else 0
+    step = later = earlier = weights = 0.0
     weight = gain
     for i in range(-1, samples):
         if i >= 0:
             demand_w = situation.jitter.samples_w[i]
-            ahead = _ahead(demand_w, situation, vehicle, policy)
-        cost = _demand_cost_j(ahead, demand_w, situation, share, cell, least, level, steps, trust, vehicle, policy)
+            ahead = _ahead(demand_w, demand_w, situation, vehicle, policy)
+        found = _demand_outlook(ahead, demand_w, situation, share, cell, least, level, vehicle, policy)
         if gain > _LASTING:
-            return cost
-        total += weight * cost
+            return found
+        step += weight * found.step_j
+        later += weight * found.later_j
+        earlier += weight * found.earlier_j
         weights += weight
         weight *= 1.0 - gain
-    return total / weights
+    return _Outlook(step / weights, later / weights, earlier / weights)
 
 
 @kernel
-def _demand_cost_j(
+def _demand_outlook(
     ahead: _Ahead,
     power_demand_w: float,
     situation: Situation,
@@ -150,18 +191,14 @@ def _demand_cost_j(
     cell: Cell,
     least: bool,
     level: float,
-    steps: float,
-    trust: float,
     vehicle: VehicleParams,
     policy: PolicyTable,
-) -> float:
-    """Right-hand side of eq. 31 for one demand and one share, J, without the price of the change.
+) -> _Outlook:
+    """Right-hand side of eq. 31 for one demand and one share, without the price of the change.
 
-    `cell` is the share's among the previous shares, `steps` how many times the step's cost counts, `trust` the part of
-    what follows; `least` asks for a bound, never larger but for rounding.
+    `cell` is the share's among the previous shares; `least` asks for a bound, never larger but for rounding.
     """
     speed, problem = situation.speed_mps, policy.problem
-    a, fa = ahead.power
     b, fb = ahead.speed
     c, fc = ahead.slip_front
     d, fd = ahead.slip_rear
@@ -175,15 +212,20 @@ def _demand_cost_j(
         b, fb = locate(policy.speed_mps, outcome.speed_mps)
         c, fc = locate(policy.slip_front, outcome.slip_front)
         d, fd = locate(policy.slip_rear, outcome.slip_rear)
-    if level <= 0.0:
-        follow_up = interpolate5(policy.expected_cost_j, a, fa, b, fb, c, fc, d, fd, e, fe)
-    else:
-        upper = min(int(level), policy.dearer_cost_j.shape[0] - 1)
-        low = policy.expected_cost_j if upper == 0 else policy.dearer_cost_j[upper - 1]
-        follow_up = interpolate5(low, a, fa, b, fb, c, fc, d, fd, e, fe)
-        high = interpolate5(policy.dearer_cost_j[upper], a, fa, b, fb, c, fc, d, fd, e, fe)
-        follow_up += (level - upper) * (high - follow_up)
-    return steps * outcome.cost_j + trust * policy.discount * follow_up
+    later = expected = 0.0
+    for i in range(1 if ahead.earlier == ahead.power else 2):
+        a, fa = ahead.power if i == 0 else ahead.earlier
+        if level <= 0.0:
+            expected = interpolate5(policy.expected_cost_j, a, fa, b, fb, c, fc, d, fd, e, fe)
+        else:
+            upper = min(int(level), policy.dearer_cost_j.shape[0] - 1)
+            low = policy.expected_cost_j if upper == 0 else policy.dearer_cost_j[upper - 1]
+            expected = interpolate5(low, a, fa, b, fb, c, fc, d, fd, e, fe)
+            high = interpolate5(policy.dearer_cost_j[upper], a, fa, b, fb, c, fc, d, fd, e, fe)
+            expected += (level - upper) * (high - expected)
+        if i == 0:
+            later = expected
+    return _Outlook(outcome.cost_j, later, expected)
 
 
 STRATEGY = Strategy("sdp_lookahead", 5, choose, needs_policy=True)
