@@ -18,6 +18,7 @@ import re
 import secrets
 import stat
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,19 @@ def make_folder(path: Path | str, *, new: bool = False) -> Path:
         allowed = f"a folder{' that is not there yet' if new else ''}"
         raise ConfigError(path, "", f"cannot be created: {error.strerror}", allowed) from None
     return folder
+
+
+@contextmanager
+def no_empty_remains(folder: Path | str) -> Iterator[None]:
+    """Whatever ends what is done meanwhile, a folder that was not there before is not left without a file in it."""
+    missing = [path for path in (Path(folder), *Path(folder).parents) if not os.path.lexists(path)]
+    try:
+        yield
+    except BaseException:
+        for path, _, _ in os.walk(missing[-1], topdown=False) if missing else ():
+            with suppress(OSError):  # it holds a result
+                os.rmdir(path)
+        raise
 
 
 def sync_folder(path: Path) -> None:

@@ -18,7 +18,7 @@ from iwm_power_manager import __version__
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.exit_codes import DONE, INTERRUPTED
-from iwm_power_manager.files import atomic_write
+from iwm_power_manager.files import atomic_write, no_empty_remains
 
 
 def described(name: str, description: str, examples: str) -> CommandParser:
@@ -39,13 +39,17 @@ def made_with(
     return ", ".join(parts)
 
 
-def ended(name: str, work: Callable[[], int | None], *, quiet: bool = False) -> int:
-    """Exit code of a command's work; what is wrong with the user's input is one line, and compiling is shown."""
+def ended(name: str, work: Callable[[], int | None], output: Path | str | None = None, *, quiet: bool = False) -> int:
+    """Exit code of a command's work; what is wrong with the user's input is one line, and compiling is shown.
+
+    A folder for its results, `output`, does not stay empty where there are none.
+    """
     from iwm_power_manager.tools.progress import show_compiling
 
     show_compiling(quiet=quiet)
     try:
-        return work() or DONE
+        with no_empty_remains(output or "."):
+            return work() or DONE
     except IwmError as error:
         print(f"{name}: error: {error}", file=sys.stderr)
         return error.exit_code

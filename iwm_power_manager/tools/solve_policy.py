@@ -9,10 +9,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import math
-import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -141,7 +139,12 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
-    return ended("solve_policy", lambda: _check(options) if options.check else _solve(options), quiet=options.quiet)
+    return ended(
+        "solve_policy",
+        lambda: _check(options) if options.check else _solve(options),
+        options.output,
+        quiet=options.quiet,
+    )
 
 
 #: What --check takes beside the files.
@@ -149,19 +152,6 @@ _OF_CHECK = {"--check", "--vehicle", "--idle-drive", "--quiet"}
 
 
 def _solve(options: argparse.Namespace) -> int:
-    """Solve; a folder that was made for policies that did not come is taken away again."""
-    folder = Path(options.output or ".")
-    there = os.path.exists(folder)
-    try:
-        return _solve_into(options)
-    except BaseException:
-        if not there:
-            with suppress(OSError):  # it holds a policy already, or was never made
-                folder.rmdir()
-        raise
-
-
-def _solve_into(options: argparse.Namespace) -> int:
     _demand_arguments(options)
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
     problem = _problem(options, vehicle)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import operator
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -92,7 +93,10 @@ def study(
         bar.refresh()
         frontier, battery, stopped, *results = on_all_cores(operator.call, tasks, jobs, lambda _: bar.update())
     places = tuple((among(cycle, cycles), friction) for cycle, friction in ablation.PLACES)
-    ablated = ablation.ablation(policies, output / "grids", jobs, say, tuple(dict.fromkeys(places)))
+    with tempfile.TemporaryDirectory(prefix="iwm-ablation-") as grids:  # of a study that is stopped, nothing is left
+        ablated = ablation.ablation(policies, Path(grids), jobs, say, tuple(dict.fromkeys(places)))
+        for grid in Path(grids).iterdir():
+            atomic_write(output / "grids" / grid.name, grid.read_bytes())
     stored = _study(policies, plan, results, frontier, battery, stopped, ablated).to_json()
     content = Study.from_json(stored)  # its numbers are those that a reader of the file has
     key = (IDLE_DRIVES[0], paper.FRICTIONS[0])

@@ -241,7 +241,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
     options.quiet |= options.json == "-"  # nothing else in what another program is to read
-    return ended("evaluate", lambda: _evaluate(options), quiet=options.quiet)
+    folder = options.study or options.frontier or options.unseen or options.save_series
+    return ended("evaluate", lambda: _evaluate(options), folder, quiet=options.quiet)
 
 
 def _evaluate(options: argparse.Namespace) -> None:

@@ -122,7 +122,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
-    return ended("learn_policy", lambda: _learn(options), quiet=options.quiet)
+    return ended("learn_policy", lambda: _learn(options), options.output, quiet=options.quiet)
 
 
 def _learn(options: argparse.Namespace) -> None:

@@ -12,10 +12,10 @@ import pytest
 
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
-from iwm_sim.study import single, unseen, variants
+from iwm_sim.study import reproduce, single, unseen, variants
 from iwm_sim.study.content import Study
 from iwm_sim.study.frontier import Frontier, Point
-from iwm_sim.tools import evaluate
+from iwm_sim.tools import evaluate, evaluate_run
 
 ROOT = Path(__file__).resolve().parents[2]
 VEHICLE = "jalalmaab_2015"
@@ -226,6 +226,29 @@ def test_the_json_of_a_table_of_the_paper_has_what_the_paper_prints(table, print
     monkeypatch.setattr(single, "paper_table", lambda *_: [])
     assert evaluate.main(["--paper", table, "--cycle", "nycc", str(hill), "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["printed"] == [printed]
+
+
+def stopped(*_, **__):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("arguments", "place"),
+    [
+        (["--study"], (reproduce, "Policies")),
+        (["--cycle", "nycc", "--frontier"], (unseen, "budgets_of")),
+        (["--unseen"], (evaluate_run, "on_all_cores")),
+        (["--cycle", "nycc", "--strategy", "equal", "--save-series"], (evaluate_run, "drive_all")),
+    ],
+)
+def test_what_is_stopped_leaves_no_folder_but_that_of_the_user(arguments, place, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(*place, stopped)
+    assert evaluate.main([*arguments, str(tmp_path / "runs" / "out")]) == 130
+    assert "nothing half-written is left" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "runs" / "out").mkdir(parents=True)
+    assert evaluate.main([*arguments, str(tmp_path / "runs" / "out")]) == 130
+    assert (tmp_path / "runs" / "out").is_dir()
 
 
 @pytest.mark.nightly
