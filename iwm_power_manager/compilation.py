@@ -9,7 +9,9 @@ import hashlib
 import itertools
 import pickle
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -83,6 +85,29 @@ class Use(NamedTuple):
 
 #: Every entry point that this process has needed, in this order.
 USES: list[Use] = []
+
+
+class NotKeptError(Exception):
+    """A kernel is not on disk, and nothing may be compiled now."""
+
+
+_KEPT_ONLY = ContextVar("kept_only", default=False)
+
+
+@contextmanager
+def kept_only() -> Iterator[None]:
+    """In the body of the `with`, in this thread, kernels are only read from disk.
+
+    Raises
+    ------
+    NotKeptError
+        One would have to be compiled, and could be kept then.
+    """
+    before = _KEPT_ONLY.set(True)
+    try:
+        yield
+    finally:
+        _KEPT_ONLY.reset(before)
 
 
 #: Functions compiled in this process, by module and name.
@@ -369,6 +394,8 @@ class _Cache(NullCache):
                 STORE.say_damaged(file)
         if result is not None:
             USES.append(Use(self._name, file or "", True, time.perf_counter() - self._started_s[sig]))
+        elif file and _KEPT_ONLY.get():
+            raise NotKeptError(f"{self._name} has not been compiled")
         elif jit.watch is not None:
             reached = kernel_cache.reach(self._kernel.py_func, lambda value: isinstance(value, Kernel)).code
             names = {" ".join(line.split()[:2]) for line in reached.splitlines()}

@@ -295,6 +295,11 @@ class Store:
                 self._say_once(f"{place.folder} cannot be written: {error.strerror or error}")
         self._say_once("no folder takes it: kernels are compiled at every start; IWM_CACHE_DIR names another folder")
 
+    def takes(self) -> bool:
+        """Whether what is saved is kept in any of the folders."""
+        self.save("writable", b"")
+        return len(self._refused) < len(self._places)
+
 
 def _write(place: Place, name: str, data: bytes) -> None:
     if place.shared:

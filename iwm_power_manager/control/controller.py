@@ -12,12 +12,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from iwm_power_manager.control.actuators import ActuatorLimits, ActuatorState, commanded, judge
+from iwm_power_manager.control.execution import COMPILED, Execution
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
 from iwm_power_manager.control.monitor import InputLimits, InputMonitor
 from iwm_power_manager.control.motion import DOUBT_SPEED
 from iwm_power_manager.control.record import Watch, to_numbers
-from iwm_power_manager.control.repeat import advance, battery_limits
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.supervision import (
     LOCKSTEP_SUPERVISION,
@@ -32,7 +32,6 @@ from iwm_power_manager.control.supervision import (
 )
 from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import Command, ControllerState, Measurement, Wheels, initial_state
-from iwm_power_manager.held import Held
 from iwm_power_manager.model.parameters import VehicleParams
 
 #: While a wheel is lost, slip is judged this much more strictly: its axle is watched through one wheel only.
@@ -80,6 +79,11 @@ class Controller:
     settings, policy, friction : may be replaced between steps; torque follows through the law's own rate limits
     table_of : the policy for a friction; with it, friction and policy follow the law's estimate (None: they stay)
     command : last command
+    execution : how the law is run (`run_by` changes it)
+
+    Parameters
+    ----------
+    execution : how the law is run at first
     """
 
     def __init__(
@@ -90,10 +94,10 @@ class Controller:
         settings: Settings,
         policy: PolicyTable,
         friction: float,
+        execution: Execution = COMPILED,
     ) -> None:
         self._vehicle = vehicle
-        self._held_vehicle = Held(vehicle)
-        self._before, self._after = Held(initial_state()), Held(initial_state())
+        self._run_by(execution, initial_state())
         self._limits = limits
         self.monitor = InputMonitor(wheel_names, limits.inputs)
         self.settings = settings
@@ -111,6 +115,14 @@ class Controller:
         self._before.value = initial_state()
         self._assumed_friction: float | None = None
         self.command: Command | None = None
+
+    def _run_by(self, execution: Execution, state: ControllerState) -> None:
+        self.execution, hold = execution, execution.hold
+        self._held_vehicle, self._before, self._after = hold(self._vehicle), hold(state), hold(state)
+
+    def run_by(self, execution: Execution) -> None:
+        """Go on in another way, from where the law is."""
+        self._run_by(execution, self.state)
 
     @property
     def state(self) -> ControllerState:
@@ -154,7 +166,7 @@ class Controller:
         self._follow_estimate()
         measurement = self._measurement(now_ns, dt_s)
         settings = self._settings()
-        command, decided, assumed = advance(
+        command, decided, assumed = self.execution.advance(
             measurement, self._before, self._after, settings, self._held_vehicle, self.policy
         )
         problem = violated_bound(command, self._vehicle)
@@ -209,7 +221,7 @@ class Controller:
             chassis, floor_mps = self._vehicle.chassis, self._vehicle.driver.power_speed_floor_mps
             demand = min(demand, TRIED_MPS2 * chassis.mass_kg * max(abs(command.speed_mps), floor_mps))
             gains = (1.0, 1.0, 1.0, 1.0)
-        discharge, charge = battery_limits(monitor.soc, monitor.temperature_c, self._held_vehicle)
+        discharge, charge = self.execution.battery_limits(monitor.soc, monitor.temperature_c, self._held_vehicle)
         factor = supervision.motor_factor
         return Measurement(
             speed_mps=speed,
@@ -228,9 +240,11 @@ class Controller:
         )
 
     def _settings(self) -> Settings:
-        if not self.wheels_lost:
-            return self.settings
         settings, factor = self.settings, LOST_WHEEL_SLIP_FACTOR
+        if self.execution.strategy is not None:
+            settings = settings._replace(strategy=self.execution.strategy)
+        if not self.wheels_lost:
+            return settings
         return settings._replace(
             critical_slip=settings.critical_slip * factor,
             slip_target=settings.slip_target * factor,

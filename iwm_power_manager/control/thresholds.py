@@ -16,6 +16,7 @@ from iwm_power_manager.control.inputs import StampLimits, ValueLimits, WheelLimi
 from iwm_power_manager.control.monitor import InputLimits
 from iwm_power_manager.control.settings import Change, Setting
 from iwm_power_manager.control.supervision import SupervisionLimits
+from iwm_power_manager.interpreted import interpreted
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.pedals import PEDAL_TRAVEL, demand_power_w
 from iwm_power_manager.model.top_speed import motor_power_w, top_speed_mps
@@ -206,7 +207,7 @@ def for_car(thresholds: Thresholds, vehicle: VehicleParams) -> Thresholds:
     top_mps = top_speed_mps(vehicle.chassis, motor_power_w(vehicle))
     speed_max_mps = max(thresholds.speed_max_mps, _BEYOND_TOP_SPEED * top_mps)
     accelerator, brake = (
-        _BEYOND_PEDALS * float(demand_power_w(PEDAL_TRAVEL, *travel, speed_max_mps, vehicle))
+        _BEYOND_PEDALS * float(interpreted(demand_power_w)(PEDAL_TRAVEL, *travel, speed_max_mps, vehicle))
         for travel in ((1.0, 0.0), (0.0, 1.0))
     )
     axles = (vehicle.front, vehicle.rear)

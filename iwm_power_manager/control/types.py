@@ -14,6 +14,7 @@ from typing import NamedTuple
 from iwm_power_manager.control.budget import Used
 from iwm_power_manager.control.persistence import Jitter, no_jitter
 from iwm_power_manager.control.yaw import YawState, no_yaw
+from iwm_power_manager.interpreted import interpreted
 
 Wheels = tuple[float, float, float, float]  # in the order of `WHEEL_NAMES`
 
@@ -335,7 +336,7 @@ def initial_state() -> ControllerState:
         wheels=(wheel, wheel, wheel, wheel),
         front_unequal_s=0.0,
         rear_unequal_s=0.0,
-        yaw=no_yaw(),
+        yaw=interpreted(no_yaw)(),
         motion=MotionState(
             speed_mps=0.0,
             bias_mps2=0.0,

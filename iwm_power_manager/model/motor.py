@@ -81,6 +81,7 @@ def regeneration_limit_nm(wheel_speed_radps: float, speed_mps: float, heat: floa
 @kernel
 def heat_after(heat: float, torque_nm: float, dt_s: float, motor: Motor) -> float:
     """Heat index after a time at a torque: a first-order lag towards (T / T_continuous)^2, stepped implicitly."""
-    target = (torque_nm / motor.continuous_torque_nm) ** 2
+    load = torque_nm / motor.continuous_torque_nm
+    target = load * load  # not `** 2`, whose last bit plain Python leaves to the C library
     gain = dt_s / (motor.thermal_time_constant_s + dt_s)
     return heat + gain * (target - heat)

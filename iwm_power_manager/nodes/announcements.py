@@ -14,6 +14,7 @@ from iwm_power_manager.control.monitor import BATTERY, DEMAND, FRICTION, SPEED, 
 from iwm_power_manager.control.supervision import MODE_DEGRADED, MODE_NORMAL, MODE_WAITING, STALE_NAMES
 from iwm_power_manager.nodes.neighbours import nobody_obeys
 from iwm_power_manager.nodes.preparation import SLOW_S, Prepared
+from iwm_power_manager.ros.diagnostics import OK, Status
 from iwm_power_manager.signals import mapping
 
 #: What the node waits for is said again after this time, and that nobody obeys it after the longer one.
@@ -66,6 +67,7 @@ class Announcements:
         self._found_s: dict[str, float] = {}
         self._odd_pedals: set[str] = set()
         self._values: Mapping[str, Any] = {}
+        self._law = ""
         self._heard_ns: Mapping[str, int] = {}
         self.activated()
 
@@ -102,6 +104,12 @@ class Announcements:
                 self._logger.warning(
                     f"{kind} goes nowhere ({prepared.mapping.path}): the motors regenerate, another system has to brake"
                 )
+
+    def law(self, status: Status) -> None:
+        """Tell how the law is run, whenever that changes."""
+        if status.message != self._law:
+            self._law = status.message
+            (self._logger.info if status.level == OK else self._logger.warning)(f"law: {status.message}")
 
     def interface(self, topics: Mapping[str, tuple[str, ...]], commands: list[str], rate: str) -> None:
         """Tell the topics the node listens to and commands on."""

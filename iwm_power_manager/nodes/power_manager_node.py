@@ -21,11 +21,13 @@ from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
 from iwm_power_manager.control.controller import Controller
+from iwm_power_manager.control.execution import COMPILED
 from iwm_power_manager.control.stepping import HELD_UP, Lockstep, RealTime, Taken
 from iwm_power_manager.errors import IwmError, one_line
 from iwm_power_manager.nodes import neighbours, pace
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.announcements import Announcements, input_topics, silent_topics
+from iwm_power_manager.nodes.compiling import Compiling, law_status
 from iwm_power_manager.nodes.demand_log import DemandLog
 from iwm_power_manager.nodes.policy_choice import Policies
 from iwm_power_manager.nodes.power_manager_inputs import Inputs
@@ -75,6 +77,7 @@ class PowerManager(Starting):
         self._stepper: Lockstep | RealTime | None = None
         self._restarts = 0
         self._policies: Policies | None = None
+        self._compiling: Compiling | None = None
         self._demand_log: DemandLog | None = None
         self._inputs: Inputs | None = None
         self._outputs: Outputs | None = None
@@ -198,6 +201,8 @@ class PowerManager(Starting):
             if self._lockstep
             else RealTime(self._controller, self._period_s, config.thresholds_of(values))
         )
+        if prepared.load is not None:
+            self._compiling = Compiling(values, prepared.load)
         if values["demand_log"]:
             path, period_s = Path(values["demand_log"]), values["demand_log_period_s"]
             self._demand_log = DemandLog(path, period_s, self._controller.policy, prepared.vehicle.params)
@@ -215,6 +220,9 @@ class PowerManager(Starting):
         self._controller = None
         self._stepper = None
         self._policies = None
+        if self._compiling:
+            self._compiling.stop()
+            self._compiling = None
         if self._demand_log:
             self._demand_log.close()
             self._demand_log = None
@@ -389,6 +397,8 @@ class PowerManager(Starting):
             self._says.preparing(self.preparing_s)
         self.go_on_starting()
         controller = self._controller
+        if controller and self._compiling:
+            self._go_over(controller, self._compiling)
         stepping = self._active and not self._lockstep
         if self._active and controller:
             if self._lockstep:
@@ -422,8 +432,17 @@ class PowerManager(Starting):
             controller.brake_gain,
         )
         gate = controller and controller.command and controller.command.gate
-        if self._changes.changed((self._active, self._fault, shown, gate), time.monotonic()):
+        law = controller and law_status(controller.execution, self._compiling)
+        if self._changes.changed((self._active, self._fault, shown, gate, law), time.monotonic()):
             self._report_soon(stepping)
+
+    def _go_over(self, controller: Controller, compiling: Compiling) -> None:
+        """Go on with the compiled law, once it is there."""
+        if compiling.ended and not compiling.problem and controller.execution is not COMPILED:
+            controller.run_by(COMPILED)
+            if self._values["gc_off_path"]:
+                realtime.keep()
+        self._says.law(law_status(controller.execution, compiling))
 
     def _on_report_timer(self) -> None:
         self._report_soon(self._active and not self._lockstep)
@@ -453,6 +472,8 @@ class PowerManager(Starting):
         statuses = []
         if self._fault:
             statuses.append(diagnostics.Status("fault", diagnostics.ERROR, self._fault, {}))
+        if self._controller:
+            statuses.append(law_status(self._controller.execution, self._compiling))
         if self._policies:
             statuses.append(self._policies.status())
         if self._demand_log:

@@ -7,13 +7,16 @@ and says what it does.
 
 from __future__ import annotations
 
+import statistics
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from iwm_power_manager.control.controller import Controller, ControllerLimits
+from iwm_power_manager.control.execution import COMPILED, Execution, plain_python
 from iwm_power_manager.control.inputs import ValueLimits
 from iwm_power_manager.control.monitor import DEMAND
 from iwm_power_manager.control.thresholds import actuator_limits, for_car, input_limits, supervision_limits
@@ -30,6 +33,8 @@ from iwm_power_manager.vehicle import Vehicle, load_vehicle
 
 #: Preparing that takes longer than this is said.
 SLOW_S = 3.0
+#: A step in plain Python may take this part of the period, the median of so many; the longest take three times as long.
+PYTHONS_PART, _TRIED_STEPS = 0.1, 20
 
 
 class Prepared(NamedTuple):
@@ -45,6 +50,7 @@ class Prepared(NamedTuple):
     remarks : what is odd about the pedals (`Assembly.remarks`)
     elapsed_s : time it took
     compiled : kernels that the cache did not hold
+    load : reads the compiled law from the cache, once it is there; None if it is in use already
     """
 
     values: Mapping[str, Any]
@@ -57,10 +63,17 @@ class Prepared(NamedTuple):
     remarks: Callable[[], dict[str, tuple[bool, str]]]
     elapsed_s: float
     compiled: int
+    load: Callable[[], None] | None = None
 
 
-def prepare(values: Mapping[str, Any]) -> Prepared:
+def prepare(values: Mapping[str, Any], at_once: bool = True) -> Prepared:
     """Load and verify everything the parameters name, and warm the compiled law.
+
+    Parameters
+    ----------
+    values : of the parameters
+    at_once : where the cache does not hold the compiled law, go without, if plain Python is fast enough and there will
+        be a cache to read it from; not in lock-step, which waits for it, and where runs are compared
 
     Raises
     ------
@@ -86,22 +99,63 @@ def prepare(values: Mapping[str, Any]) -> Prepared:
     estimated = values["friction_source"] == config.ESTIMATED
     friction = settings.friction_prior if estimated else values["friction"]
     table = policies.table(friction)
-    controller = Controller(mapping.car(vehicle.params), names, limits, settings, table, friction)
-    readers, commands, assembly = _interface(mapping, controller, vehicle, values, limits.inputs.demand)
-    # The first call compiles the law or reads it from the cache: seconds that no control step may take.
-    for warmed in policies.tables():
-        controller.policy = warmed
-        controller.step(0, 1.0 / values["rate_hz"])
-    controller.policy = table
-    controller.table_of = policies.table if estimated else None
-    controller.reset()
-    from iwm_power_manager.compilation import USES  # the warm law has imported it; nobody waits for it before
+    period_s = 1.0 / values["rate_hz"]
 
-    compiled = sum(not use.found for use in USES)
-    elapsed_s = time.monotonic() - started_s
+    def made(execution: Execution) -> Controller:
+        return Controller(mapping.car(vehicle.params), names, limits, settings, table, friction, execution)
+
+    def warm(controller: Controller) -> None:
+        # The first call compiles the law or reads it from the cache: seconds that no control step may take.
+        for warmed in policies.tables():
+            controller.policy = warmed
+            controller.step(0, period_s)
+        controller.policy = table
+        controller.reset()
+
+    def load() -> None:
+        with kept_only():
+            warm(made(COMPILED))
+
+    controller = made(plain_python())
+    readers, commands, assembly = _interface(mapping, controller, vehicle, values, limits.inputs.demand)
+    from iwm_power_manager.compilation import STORE, USES, NotKeptError, kept_only  # only now: it takes a moment
+
+    compiled = False
+    with suppress(NotKeptError):
+        load()
+        compiled = True
+    if not compiled:
+        warm(controller)
+        can_wait = at_once and not values["lockstep"] and STORE.takes() and _keeps_up(controller, period_s)
+        if compiled := not can_wait:
+            warm(made(COMPILED))
+    if compiled:
+        controller.run_by(COMPILED)
+    controller.table_of = policies.table if estimated else None
     return Prepared(
-        values, vehicle, policies, controller, mapping, readers, commands, assembly.remarks, elapsed_s, compiled
+        values,
+        vehicle,
+        policies,
+        controller,
+        mapping,
+        readers,
+        commands,
+        assembly.remarks,
+        time.monotonic() - started_s,
+        sum(not use.found for use in USES),
+        None if compiled else load,
     )
+
+
+def _keeps_up(controller: Controller, period_s: float) -> bool:
+    """Whether steps take no more than their part of the period."""
+    took_s = []
+    for _ in range(_TRIED_STEPS):
+        started_s = time.perf_counter()
+        controller.step(0, period_s)
+        took_s.append(time.perf_counter() - started_s)
+    controller.reset()
+    return statistics.median(took_s) <= PYTHONS_PART * period_s
 
 
 def _interface(
@@ -123,7 +177,6 @@ def _interface(
     most_nm = max(max(axle.motor.peak_torque_nm, axle.friction_brake.max_torque_nm) for axle in axles)
     commands = {kind: CommandWriter(mapping.path, sinks, most_nm) for kind, sinks in mapping.commands.items()}
     readers = topic_readers(mapping, types, assembly)
-    assembly.warm(mapping.sources)
     limits = f"demand_min_w {demand.minimum:g} to demand_max_w {demand.maximum:g}"
     monitor.tallies[DEMAND].describe = lambda: f"{assembly.wanted_in_words()}; allowed: {limits}"
     return readers, commands, assembly

@@ -44,6 +44,11 @@ def stop_automatic_collection() -> None:
     gc.disable()
 
 
+def keep() -> None:
+    """Exempt what has come since `stop_automatic_collection` from later collections, too."""
+    gc.freeze()
+
+
 def collect() -> None:
     """Collect what has become garbage since `stop_automatic_collection`."""
     gc.collect()

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.interpreted import interpreted
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.pedals import ACCELERATION, FORCE, PEDAL_TRAVEL, TORQUE, demand_power_w
 from iwm_power_manager.signals.cdr import (
@@ -55,7 +56,9 @@ _NS_PER_S = 1e9
 _MISSED_SETS = 3
 #: A pedal may show a little more than its way; more than this is another unit, or another sign.
 _TRAVEL = (-0.1, 1.1)
-#: What a demand that is no power is to `demand_power_w`.
+#: One number for each message: compiled code would only have more to convert.
+_power_w = interpreted(demand_power_w)
+#: What a demand that is no power is to it.
 KINDS = {"force_demand": FORCE, "torque_demand": TORQUE, "acceleration_demand": ACCELERATION}
 _ARTICLES = {
     "number": "a number",
@@ -180,7 +183,7 @@ class Assembly:
         power_w = value
         if signal != "power_demand":
             assert self.vehicle is not None  # checked when the readers were made
-            power_w = float(demand_power_w(KINDS[signal], value, 0.0, abs(self._speed_mps()), self.vehicle))
+            power_w = _power_w(KINDS[signal], value, 0.0, abs(self._speed_mps()), self.vehicle)
         self._wanted = signal, value, power_w
         return (DemandReading(time_ns, power_w),)
 
@@ -201,9 +204,7 @@ class Assembly:
             signal, value = (PEDALS[1], brake) if math.isnan(travel) else (PEDALS[0], accelerator)
         power_w = _NAN
         if not math.isnan(travel):
-            power_w = float(
-                demand_power_w(PEDAL_TRAVEL, _way(accelerator), travel, abs(self._speed_mps()), self.vehicle)
-            )
+            power_w = _power_w(PEDAL_TRAVEL, _way(accelerator), travel, abs(self._speed_mps()), self.vehicle)
         self._wanted = signal, value, power_w
         return (DemandReading(time_ns, power_w, max(time_ns - oldest_ns, 0) / _NS_PER_S),)
 
@@ -226,12 +227,6 @@ class Assembly:
         """What is odd about pedals, by signal, and whether it is sure: in %, and never beyond a hundredth."""
         found = {pedal: (use.released, use.remark(self.sources.get(pedal, ()))) for pedal, use in self._use.items()}
         return {pedal: (sure, text) for pedal, (sure, text) in found.items() if text}
-
-    def warm(self, signals: Iterable[str]) -> None:
-        """Compile what the conversion of these signals needs, or read it from the cache."""
-        for signal in signals:
-            if self.vehicle is not None and (signal in KINDS or signal in PEDALS):
-                demand_power_w(KINDS.get(signal, PEDAL_TRAVEL), 0.0, 0.0, 0.0, self.vehicle)
 
     def wheel(self, signal: str, wheel: int, time_ns: int, value: float) -> tuple[Reading, ...]:
         """One wheel's number; a reading once all four have come, or one of them has stayed away for long."""

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba.core import config as numba_config
 
-from iwm_power_manager.control import controller as module
 from iwm_power_manager.control import law
 from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
+from iwm_power_manager.control.execution import COMPILED
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES, SIGNALS, completed, from_numbers, step_of
 from iwm_power_manager.control.settings import default_settings
@@ -454,17 +454,15 @@ class TestFriction:
 
 class TestFaultOfTheLaw:
     @pytest.mark.parametrize("torque", [math.nan, 1e6])
-    def test_what_no_motor_may_be_given_never_leaves(self, drive, monkeypatch, torque) -> None:
+    def test_what_no_motor_may_be_given_never_leaves(self, drive, torque) -> None:
         drive.run(60)
         good = drive.controller.command
 
-        real = module.advance
-
         def broken(*arguments: Any) -> Any:
-            command, *rest = real(*arguments)
+            command, *rest = COMPILED.advance(*arguments)
             return command._replace(motor_torque_nm=(torque, 0.0, 0.0, 0.0)), *rest
 
-        monkeypatch.setattr(module, "advance", broken)
+        drive.controller.run_by(COMPILED._replace(advance=broken))
         state = drive.controller.state
         with pytest.raises(ControlFaultError, match="wheel 0"):
             drive.controller.step(drive.now_ns, DT)
