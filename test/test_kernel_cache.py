@@ -245,6 +245,29 @@ def test_kernels_that_nobody_has_read_for_long_are_removed(tmp_path, monkeypatch
     assert [path.name for path in (tmp_path / KERNELS).iterdir()] == ["new"]
 
 
+KEPT_ONLY = """
+import toy.law, toy.state
+from iwm_power_manager.compilation import NotKeptError, kept_only
+try:
+    with kept_only():
+        toy.law.step(toy.state.State(a=1.0, b=0.5), 3.0)
+except NotKeptError as error:
+    print(error, end="; ")
+"""
+
+
+def test_where_only_kept_kernels_may_be_used_one_that_is_not_kept_is_an_error_and_not_compiled(toy, tmp_path) -> None:
+    assert run(toy, tmp_path / "cache", before=KEPT_ONLY)[0] == "toy.law.step has not been compiled; 60.5 False"
+    assert run(toy, tmp_path / "cache", before=KEPT_ONLY)[0] == "60.5 True"
+
+
+def test_a_store_knows_whether_it_takes_anything(tmp_path) -> None:
+    (tmp_path / "file").touch()
+    refusing, taking = Place(tmp_path / "file"), Place(tmp_path / "folder")
+    assert Store([refusing, taking], lambda _: None).takes()
+    assert not Store([refusing], lambda _: None).takes()
+
+
 def kernel_modules() -> list[str]:
     """Every module that holds a kernel."""
     return [

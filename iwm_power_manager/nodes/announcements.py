@@ -109,7 +109,7 @@ class Announcements:
         """Tell how the law is run, whenever that changes."""
         if status.message != self._law:
             self._law = status.message
-            (self._logger.info if status.level == OK else self._logger.warning)(f"law: {status.message}")
+            self._say(f"law: {status.message}", status.level != OK)
 
     def interface(self, topics: Mapping[str, tuple[str, ...]], commands: list[str], rate: str) -> None:
         """Tell the topics the node listens to and commands on."""
@@ -136,7 +136,7 @@ class Announcements:
         """Tell once what is odd about each pedal, and warn of what is sure (`Assembly.remarks`)."""
         for pedal in remarks.keys() - self._odd_pedals:
             sure, text = remarks[pedal]
-            (self._logger.warning if sure else self._logger.info)(text)
+            self._say(text, sure)
         self._odd_pedals |= remarks.keys()
 
     def problems(self, found: list[str]) -> None:
@@ -242,6 +242,12 @@ class Announcements:
             where = ", ".join(topic for topic in found and (silent or found) if topic != name)
             parts.append(f"{name}" + (f" on {where}" if where else "") + (f" ({reason})" if reason else ""))
         return ", ".join(parts)
+
+    def _say(self, text: str, is_warning: bool) -> None:
+        if is_warning:  # each in a line of its own: a line that logs at one level may not log at another one
+            self._logger.warning(text)
+        else:
+            self._logger.info(text)
 
     def _due(self, what: str, every_s: float = REPEAT_S) -> bool:
         now = time.monotonic()

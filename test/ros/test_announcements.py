@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import rclpy.logging
 
 from iwm_power_manager.control.inputs import Violation
 from iwm_power_manager.control.monitor import DEMAND, Tally
@@ -20,6 +21,7 @@ from iwm_power_manager.control.supervision import (
     Supervision,
 )
 from iwm_power_manager.nodes.announcements import Announcements
+from iwm_power_manager.ros.diagnostics import OK, WARN, Status
 
 VALUES = {"missed_periods": 3, **{f"input_period_s.{name}": 0.01 for name in STALE_NAMES.values()}}
 
@@ -158,3 +160,17 @@ def test_who_obeys_within_a_moment_of_activation_is_no_news(log: Log) -> None:
     says.commands(["/motors"])
     says.commands([])
     assert log.lines == []
+
+
+def test_the_log_of_ros_takes_warnings_and_remarks_on_the_same_thing() -> None:
+    says = Announcements(rclpy.logging.get_logger("announcements"))
+    says.pedals({"brake_pedal": (True, "surely in %"), "accelerator_pedal": (False, "perhaps in %")})
+    says.law(Status("law", WARN, "plain Python", {}))
+    says.law(Status("law", OK, "compiled", {}))
+
+
+def test_how_the_law_is_run_is_told_when_it_changes(log: Log) -> None:
+    says = Announcements(log)
+    for message in ("plain Python", "plain Python", "compiled", "compiled"):
+        says.law(Status("law", OK, message, {}))
+    assert log.lines == ["law: plain Python", "law: compiled"]

@@ -169,10 +169,20 @@ class TestDiagnostics:
         full_name = f"{bench.node.get_namespace()}/power_manager"
         assert {status.name for status in bench.diagnostics[-1].status} == {
             f"{full_name}: {name}"
-            for name in ("control", "inputs", "sensors", "motors", "brakes", "control loop", "policy", "command topics")
+            for name in (
+                "control",
+                "inputs",
+                "sensors",
+                "motors",
+                "brakes",
+                "control loop",
+                "law",
+                "policy",
+                "command topics",
+            )
         }
         assert {status.hardware_id for status in bench.diagnostics[-1].status} == {full_name}
-        for name in ("control", "inputs", "policy", "command topics"):
+        for name in ("control", "inputs", "law", "policy", "command topics"):
             bench.drive(lambda name=name: bench.status(name).level == DiagnosticStatus.OK, f"{name} to be ok")
 
     def test_it_tells_ages_rates_and_times(self, bench) -> None:
