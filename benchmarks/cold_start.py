@@ -3,7 +3,7 @@
 
 Each run is a process of its own: import, vehicle, policy, first step. `--peer FOLDER` runs another checkout beside it,
 in turns, so that both see the same machine. Of this checkout alone it also times every command's `--help`, and the node
-until it is active with a full cache.
+until its first step with either cache, and until it drives with the compiled law.
 """
 
 from __future__ import annotations
@@ -85,40 +85,57 @@ def help_s(target: str, cache: Path) -> tuple[float, float]:
     return passed, after.children_user + after.children_system - used.children_user - used.children_system
 
 
-def active_s(cache: Path) -> tuple[float, float]:
-    """Seconds until the node's first control step is heard, on the clock and of the processor (to its end)."""
+def node_s(cache: Path) -> dict[str, tuple[float, float]]:
+    """Seconds until the node's first control step is heard, and until it says that its law is compiled.
+
+    On the clock, and of the processor: to the step that of the node alone, to the compiled law also that of the process
+    that compiles, and of ending both.
+    """
     import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
     from sensor_msgs.msg import JointState
 
     from iwm_sim.domains import claimed_domain
 
     heard: list[JointState] = []
+    reports: list[DiagnosticArray] = []
+
+    def compiled() -> bool:
+        said = [status for report in reports for status in report.status if status.name.endswith(": law")]
+        return any(status.message == "compiled" for status in said)
+
     with claimed_domain() as domain:
         context = rclpy.Context()
         rclpy.init(context=context, domain_id=domain, args=[])
         listener = rclpy.create_node("cold_start", context=context)
         listener.create_subscription(JointState, "power_manager/state", heard.append, 10)
+        listener.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 10)
         executor = rclpy.executors.SingleThreadedExecutor(context=context)
         executor.add_node(listener)
         environment = environment_of(ROOT, cache) | {"ROS_DOMAIN_ID": str(domain)}
         started, used = time.perf_counter(), os.times()
+        first: tuple[float, float] | None = None
         with subprocess.Popen(
             [sys.executable, "-m", "iwm_power_manager.nodes.power_manager"],
             env=environment,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         ) as node:
-            while not heard and node.poll() is None:
+            while not (first and compiled()) and node.poll() is None:
                 executor.spin_once(timeout_sec=0.01)
+                if heard and first is None:
+                    ticks = Path(f"/proc/{node.pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+                    first = time.perf_counter() - started, sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
             passed = time.perf_counter() - started
             node.send_signal(signal.SIGINT)
         executor.shutdown()
         listener.destroy_node()
         rclpy.shutdown(context=context)
-    if not heard:
-        raise SystemExit("the node ended before its first step")
+    if first is None or not compiled():
+        raise SystemExit("the node ended before its law was compiled")
     after = os.times()
-    return passed, after.children_user + after.children_system - used.children_user - used.children_system
+    spent = after.children_user + after.children_system - used.children_user - used.children_system
+    return {"first step": first, "compiled law": (passed, spent)}
 
 
 def median_line(name: str, measured: list[tuple[float, float]], what: str) -> str:
@@ -132,7 +149,7 @@ def median_line(name: str, measured: list[tuple[float, float]], what: str) -> st
 
 
 def started_programs(repeat: int) -> dict[str, list[tuple[float, float]]]:
-    """Times of each `--help`, and of the node with a full cache."""
+    """Times of each `--help`, and of the node with an empty and with a full cache."""
     commands = {
         entry.name: entry.value
         for entry in metadata.distribution("iwm_power_manager").entry_points
@@ -143,8 +160,15 @@ def started_programs(repeat: int) -> dict[str, list[tuple[float, float]]]:
         cache = Path(folder)
         for name, target in sorted(commands.items()):
             times[f"{name} --help"] = [help_s(target, cache) for _ in range(repeat)]
-        active_s(cache)  # fills the cache
-        times["power_manager"] = [active_s(cache) for _ in range(repeat)]
+        for _ in range(repeat):
+            with tempfile.TemporaryDirectory(dir=folder) as empty:
+                cold, warm = node_s(Path(empty)), node_s(Path(empty))
+            for name, measured in (
+                ("power_manager", warm["first step"]),
+                ("power_manager, empty cache", cold["first step"]),
+                ("power_manager, empty cache, compiled", cold["compiled law"]),
+            ):
+                times.setdefault(name, []).append(measured)
     return times
 
 
@@ -167,7 +191,8 @@ def main() -> None:
             print(median_line(f"{name:5} {kind}", measured, "to the first command"))
     programs = started_programs(options.repeat)
     for name, measured in programs.items():
-        print(median_line(f"{name:22}", measured, "until its first step" if name == "power_manager" else ""))
+        what = "until its first step" if name.startswith("power_manager") else ""
+        print(median_line(f"{name:22}", measured, "until its law is compiled" if name.endswith("compiled") else what))
     if options.json:
         Path(options.json).write_text(json.dumps(times | programs, indent=2) + "\n")
 
