@@ -36,8 +36,8 @@ _LEAST = 2.0
 
 #: What a price that is higher by one in the logarithm takes from the changes, as a part of the budget.
 ELASTICITY = 0.35
-#: Price at a full first bucket beside what its end asks for, and at a full second one, which is free to its half.
-BUSY, HURRIED = 2.0, math.exp(2.0)
+#: Price at a full second bucket, which is free to its half. At a full first one it is 2, beside what its end asks for.
+HURRIED = math.exp(2.0)
 _FULL = 0.99
 _ROUNDING = 1e-9
 
@@ -109,7 +109,7 @@ def price_factor(used: Used, changes_per_min: float) -> float:
     level = min(used.lasting / size.lasting, _FULL)
     steep = 0.5 * math.pi / (ELASTICITY * size.lasting)
     hurry = max(2.0 * min(used.minute / size.minute, 1.0) - 1.0, 0.0)
-    return BUSY**level * HURRIED**hurry * (1.0 + steep * math.tan(0.5 * math.pi * level))
+    return math.exp2(level) * HURRIED**hurry * (1.0 + steep * math.tan(0.5 * math.pi * level))
 
 
 @kernel

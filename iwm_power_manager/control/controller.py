@@ -117,8 +117,9 @@ class Controller:
         self.command: Command | None = None
 
     def _run_by(self, execution: Execution, state: ControllerState) -> None:
-        self.execution, hold = execution, execution.hold
-        self._held_vehicle, self._before, self._after = hold(self._vehicle), hold(state), hold(state)
+        vehicle, before, after = map(execution.hold, (self._vehicle, initial_state(), initial_state()))
+        before.value = state  # of the same types, or it is refused and all stays as it was
+        self.execution, self._held_vehicle, self._before, self._after = execution, vehicle, before, after
 
     def run_by(self, execution: Execution) -> None:
         """Go on in another way, from where the law is."""

@@ -439,7 +439,10 @@ class PowerManager(Starting):
     def _go_over(self, controller: Controller, compiling: Compiling) -> None:
         """Go on with the compiled law, once it is there."""
         if compiling.ended and not compiling.problem and controller.execution is not COMPILED:
-            controller.run_by(COMPILED)
+            try:
+                controller.run_by(COMPILED)
+            except Exception as error:  # noqa: BLE001 - it drives as it is
+                compiling.problem = one_line(f"{type(error).__name__}: {error}")
             if self._values["gc_off_path"]:
                 realtime.keep()
         self._says.law(law_status(controller.execution, compiling))

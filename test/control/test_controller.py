@@ -15,7 +15,7 @@ from numba.core import config as numba_config
 
 from iwm_power_manager.control import law
 from iwm_power_manager.control.controller import ControlFaultError, Controller, ControllerLimits
-from iwm_power_manager.control.execution import COMPILED
+from iwm_power_manager.control.execution import COMPILED, plain_python
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.record import SIGNAL_NAMES, SIGNALS, completed, from_numbers, step_of
 from iwm_power_manager.control.settings import default_settings
@@ -468,6 +468,46 @@ class TestFaultOfTheLaw:
             drive.controller.step(drive.now_ns, DT)
         assert drive.controller.command is good
         assert drive.controller.state == state
+
+
+class TestGoingOver:
+    def test_from_plain_python_to_the_compiled_law_every_number_stays_what_it_was(self) -> None:
+        """Three drives, which are the same: compiled, in plain Python, and from one to the other on the way."""
+        compiled, plain, over = Drive(), Drive(), Drive()
+        plain.controller.run_by(plain_python())
+        over.controller.run_by(plain_python())
+        for k in range(400):
+            speed = 12.0 * math.cos(0.02 * k)
+            rims = tuple(speed / RADIUS * (1.0 + 0.1 * math.sin(0.7 * k + i)) for i in range(4))
+            lost = [name for name, since in (("speed", 60), ("wheels", 160), ("demand", 260)) if since < k < since + 30]
+            if k == 200:
+                over.controller.run_by(COMPILED)
+            for drive in (compiled, plain, over):
+                drive.send(speed=speed, wheels=rims, demand=2e4 * math.sin(0.1 * k), without=lost)
+                drive.step()
+        assert repr(plain.steps) == repr(compiled.steps)
+        assert repr(over.steps) == repr(compiled.steps)
+        assert repr(plain.controller.state) == repr(over.controller.state) == repr(compiled.controller.state)
+        assert not plain.controller.execution.faults
+
+    def test_until_then_the_split_is_equal_whatever_strategy_is_chosen(self) -> None:
+        chosen, equal = Drive(strategy="rule"), Drive()
+        chosen.controller.run_by(plain_python())
+        assert chosen.run(100) == equal.run(100)
+        chosen.controller.run_by(COMPILED)
+        equal.controller.settings = default_settings("rule")
+        assert chosen.run(100) == equal.run(100)
+        assert chosen.steps[-1]["setting.strategy"] == default_settings("rule").strategy
+
+    def test_what_cannot_be_gone_over_to_leaves_all_as_it_was(self, drive) -> None:
+        def refused(_: Any) -> Any:
+            raise TypeError("of other types")
+
+        drive.controller.run_by(plain_python())
+        drive.run(60)
+        with pytest.raises(TypeError):
+            drive.controller.run_by(COMPILED._replace(hold=refused))
+        assert drive.run(1)["mode"] == MODE_NORMAL
 
 
 # What a broken network, a broken sensor or a broken program may send.

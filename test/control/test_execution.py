@@ -34,7 +34,7 @@ def bits(value: Any) -> Any:
         return tuple(map(bits, value))
     if isinstance(value, float):
         return "nan" if math.isnan(value) else struct.pack("<d", value)
-    return int(value)
+    return type(value) is int or "flag", int(value)
 
 
 def any_of(low: float, high: float) -> st.SearchStrategy[float]:
