@@ -55,6 +55,28 @@ def test_what_it_cannot_start_with_gives_one_line(tmp_path, parameters, expected
     assert expected in fails_with(tmp_path, arguments(parameters))
 
 
+@pytest.mark.parametrize(
+    ("right", "wrong"), [("topic: /odom", "topik: /odom"), ("linear.x", "linear.q"), ("msg/Odometry", "msg/Odometri")]
+)
+def test_a_mistake_in_a_signals_file_is_told_before_anything_is_compiled(tmp_path, right, wrong) -> None:
+    text = resolve("config/signals/odometry_and_pedals.yaml").read_text()
+    (tmp_path / "signals.yaml").write_text(text.replace(right, wrong))
+    program = f"""
+import sys
+from iwm_power_manager.errors import IwmError
+from iwm_power_manager.nodes import power_manager_config as config
+from iwm_power_manager.nodes.preparation import prepare
+values = {{spec.name: spec.default for spec in config.SPECS}}
+try:
+    prepare(values | {{"signals_file": {str(tmp_path / "signals.yaml")!r}}})
+except IwmError as error:
+    print(error, "numba" in sys.modules)
+"""
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert "signals.speed" in told
+    assert told.endswith(" False\n")
+
+
 def test_a_damaged_policy_gives_one_line(tmp_path) -> None:
     damaged = tmp_path / "policy.npz"
     damaged.write_bytes(b"PK\x03\x04 and then nothing that makes sense")
