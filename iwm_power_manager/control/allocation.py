@@ -18,6 +18,7 @@ from iwm_power_manager.control.axle import (
     unequal_s,
     yaw_moments_nm,
 )
+from iwm_power_manager.control.one_road import least_road_nm
 from iwm_power_manager.control.settings import GATE_MODE_OFF, Settings
 from iwm_power_manager.control.slip import worse_slip
 from iwm_power_manager.control.split import split
@@ -93,17 +94,19 @@ def drive(
     # 3. gate, 4. capacity
     mode = settings.gate_mode if slip_control else GATE_MODE_OFF
     slips = (fl_slip, fr_slip, rl_slip, rr_slip)
+    # Of wheels that are alike none slips alone.
+    least_nm = (0.0, 0.0, 0.0, 0.0) if front_alike and rear_alike else least_road_nm(before, vehicle)
     front_nm = yaw_moments_nm(s.front_yaw_nm, s.front_yaw_growth_nmps, s.front_yaw_most_nm, front_s, speed, braking, s)
     rear_nm = yaw_moments_nm(s.rear_yaw_nm, s.rear_yaw_growth_nmps, s.rear_yaw_most_nm, rear_s, speed, braking, s)
     if braking:
         front_nm, rear_nm = with_yaw(front_nm, rear_nm, front_s, yaw)
     front = pair_of(
-        0, measurement, slips, speed, lower_part, mode, targets, front_nm, first, before, front_alike, vehicle.front, s,
-        vehicle,
+        0, measurement, slips, speed, lower_part, mode, targets, least_nm, front_nm, first, before, front_alike,
+        vehicle.front, s, vehicle,
     )  # fmt: skip
     rear = pair_of(
-        2, measurement, slips, speed, lower_part, mode, targets, rear_nm, first, before, rear_alike, vehicle.rear, s,
-        vehicle,
+        2, measurement, slips, speed, lower_part, mode, targets, least_nm, rear_nm, first, before, rear_alike,
+        vehicle.rear, s, vehicle,
     )  # fmt: skip
     # Without slip control nothing keeps a single axle from locking.
     share = memory.applied_share if slip_control else 0.5

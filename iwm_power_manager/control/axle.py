@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from iwm_power_manager.control.direction import MOVING_MPS
+from iwm_power_manager.control.one_road import UNEQUAL_PART
 from iwm_power_manager.control.settings import GATE_MODE_TABLE2, Settings
 from iwm_power_manager.control.slew import slewed
 from iwm_power_manager.control.slip import worse_slip
@@ -32,10 +33,8 @@ from iwm_power_manager.model.torque import between_wheels, blend
 
 #: A motor torque below this is rounding noise of a share or a fade; zero lets the drive go idle.
 ZERO_TORQUE_NM = 1e-6
-#: Torques that have been unequal for longer than this are no passing bump, s; and roads whose wheels can take torques
-#: that are less than this part apart are no two roads.
+#: Torques that have been unequal for longer than this are no passing bump, s.
 UNEQUAL_S = 0.03
-UNEQUAL_PART = 0.2
 #: The yaw budget grows with one over the square of the speed, up to the square of this.
 MOST_YAW_SPEED = 2.0
 #: Slip of the front wheel that grips, and of the rear ones, where the yaw rate is watched.
@@ -162,6 +161,7 @@ def pair_of(
     lower_part: float,
     gate_mode: int,
     targets: Wheels,
+    least_nm: Wheels,
     moments_nm: tuple[float, float],
     first: bool,
     before: FourWheels,
@@ -177,14 +177,14 @@ def pair_of(
     if gate_mode == GATE_MODE_TABLE2:
         left_gate = right_gate = worse_slip(slips[k], slips[k + 1])
     left = wheel_of(
-        w[k], slips[k], left_gate, speed_mps, demand, gain[k], lower_part, gate_mode, targets[k], dt, first,
-        before[k], w[k + 1], before[k + 1], axle, settings, vehicle,
+        w[k], slips[k], left_gate, speed_mps, demand, gain[k], lower_part, gate_mode, targets[k], least_nm[k], dt,
+        first, before[k], w[k + 1], before[k + 1], axle, settings, vehicle,
     )  # fmt: skip
     right = left
     if not alike:
         right = wheel_of(
             w[k + 1], slips[k + 1], right_gate, speed_mps, demand, gain[k + 1], lower_part, gate_mode, targets[k + 1],
-            dt, first, before[k + 1], w[k], before[k], axle, settings, vehicle,
+            least_nm[k + 1], dt, first, before[k + 1], w[k], before[k], axle, settings, vehicle,
         )  # fmt: skip
     left_capacity, right_capacity = _capacities_nm(left, right, moments_nm, axle)
     return Pair(left, right, left_capacity, right_capacity, alike)

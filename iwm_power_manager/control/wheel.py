@@ -64,6 +64,28 @@ def wheel_slip(
 
 
 @kernel
+def _slips_by_little(
+    braking: bool,
+    taken_nm: float,
+    speed_radps: float,
+    other_radps: float,
+    speed_mps: float,
+    least_nm: float,
+    radius_m: float,
+    vehicle: VehicleParams,
+) -> bool:
+    """Whether a wheel slips by less than the smoothest ice gives, or, alone of its axle, than the road the others.
+
+    It is there, or on another road, or has a wrong sensor. With nothing it comes back, or it has.
+    """
+    sign, held = 1.0 if braking else -1.0, HELD_PART * speed_mps + HELD_MPS
+    little_nm = FREE_PART * 0.25 * vehicle.chassis.mass_kg * GRAVITY_MPS2 * radius_m
+    if sign * radius_m * (other_radps - speed_radps) > held:
+        little_nm = max(little_nm, least_nm)
+    return taken_nm < little_nm and sign * (speed_mps - radius_m * speed_radps) > held
+
+
+@kernel
 def wheel_of(
     wheel_speed_radps: float,
     slip: float,
@@ -74,6 +96,7 @@ def wheel_of(
     lower_part: float,
     gate_mode: int,
     slip_target: float,
+    least_nm: float,
     dt_s: float,
     first: bool,
     before: WheelState,
@@ -83,7 +106,10 @@ def wheel_of(
     settings: Settings,
     vehicle: VehicleParams,
 ) -> Wheel:
-    """Steps 1, 3 and 4 for one wheel; `gate_slip` is the slip its gate goes by, `other` the axle's other wheel."""
+    """Steps 1, 3 and 4 for one wheel; `gate_slip` is the slip its gate goes by, `other` the axle's other wheel.
+
+    `least_nm` is what the road takes from it at least, as the others have it.
+    """
     braking = demand_w < 0.0
     radius = axle.wheel.radius_m
     # A braked wheel is not faster than the car: one that seems to be must not weaken the brakes.
@@ -122,12 +148,9 @@ def wheel_of(
             radius,
             axle.wheel.inertia_kgm2,
         )
-        # What slips by so little is on the smoothest ice or has a wrong sensor. With nothing it comes back, or it has.
         asked = braking or (settings.gate_driving and demand_w > 0.0)
-        slipped = (speed_mps - radius * wheel_speed_radps) * (1.0 if braking else -1.0)
-        free_nm = FREE_PART * 0.25 * vehicle.chassis.mass_kg * GRAVITY_MPS2 * radius
-        if asked and max(grip, abs(road)) < free_nm and slipped > HELD_PART * speed_mps + HELD_MPS:
-            gated = True
+        taken_nm, w, other = max(grip, abs(road)), wheel_speed_radps, other_radps
+        gated = gated or (asked and _slips_by_little(braking, taken_nm, w, other, speed_mps, least_nm, radius, vehicle))
     return Wheel(
         speed_radps=wheel_speed_radps,
         conversion_radps=conversion,

@@ -64,6 +64,8 @@ CARS["unequal"] = CAR._replace(
 )
 #: The brakes are another system's.
 CARS["without brakes"] = CAR.with_axles(friction_brake=CAR.front.friction_brake._replace(max_torque_nm=0.0))
+#: Its loads stay as they are.
+LOW = CAR._replace(chassis=CAR.chassis._replace(cg_height_m=0.0))
 RADIUS = CAR.front.wheel.radius_m
 TABLE = empty_table(rule=(300.0, 0.4, -200.0, 0.7), schedule=(0.5, 0.0, 1.0, 0.3, 0.85, 1.0))
 DEFAULT = default_settings("equal")
@@ -931,6 +933,48 @@ def test_a_wheel_that_keeps_its_slip_with_next_to_no_torque_gets_none(demand):
         gates.append(case.command.gate)
     assert set(gates[-20:]) == {t.GATE_BOTH}
     assert case.command.motor_torque_nm == (0.0,) * 4
+
+
+@st.composite
+def braked_wheels(draw):
+    """Four wheels of one step, braked near what roads give: their slips and torques, and which are gated."""
+    slips = draw(st.tuples(*[st.floats(0.0, 0.25)] * 4))
+    torques = draw(st.tuples(*[st.floats(0.0, 450.0)] * 4))
+    gated = draw(st.tuples(*[st.sampled_from((False, False, True))] * 4))
+    demand, dt = draw(st.sampled_from((-30e3, -90e3))), draw(st.sampled_from((0.005, 0.01)))
+    m = measurement(demand=demand, dt=dt)
+    m = m._replace(wheel_speed_radps=tuple(15.0 / RADIUS * (1.0 - slip) for slip in slips))
+    wheel = initial_state().wheels[0]
+    wheels = tuple(
+        wheel._replace(total_nm=-nm, road_nm=-nm, slip=-slip, gated=gate, speed_radps=w)
+        for nm, slip, gate, w in zip(torques, slips, gated, m.wheel_speed_radps, strict=True)
+    )
+    return m, initial_state()._replace(steps=5, wheels=wheels)
+
+
+@settings(max_examples=EXAMPLES)
+@given(braked_wheels())
+def test_wheels_braked_near_what_roads_give_are_gated_as_in_the_plain_law(drawn):
+    it_does_what_the_plain_law_does(take(*drawn))
+
+
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("friction", [0.2, 0.5])
+def test_a_wheel_that_alone_of_its_axle_slips_by_less_than_the_road_gives_the_others_gets_no_torque(wheel, friction):
+    """Both of an axle may be on another road than the other two; and with as much as the others it is on theirs."""
+    alone, both, rolling = {wheel}, {wheel, wheel ^ 1}, 0.05
+    for slipping, part, gated in ((alone, 0.4, 1 << wheel), (alone, 0.8, 0), (both, 0.4, 0)):
+        slips = [0.155 if i in slipping or i == wheel ^ 2 else rolling for i in range(4)]
+        torques = [
+            friction * (part if i in slipping else 1.0) * CAR.chassis.mass_kg / 4.0 * G * RADIUS for i in range(4)
+        ]
+        m = measurement(demand=-90e3)
+        m = m._replace(wheel_speed_radps=tuple(15.0 / RADIUS * (1.0 - slip) for slip in slips))
+        states = tuple(
+            initial_state().wheels[0]._replace(total_nm=-nm, road_nm=-nm, slip=-slip, speed_radps=w)
+            for nm, slip, w in zip(torques, slips, m.wheel_speed_radps, strict=True)
+        )
+        assert take(m, initial_state()._replace(steps=5, wheels=states), car=LOW).command.gated_wheels == gated
 
 
 # --- Direction: what the whole law makes of a car that moves the wrong way, or both ways ------------------------------

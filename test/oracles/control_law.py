@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from iwm_power_manager.control import types as t
 from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, GATE_MODE_TABLE2
 from oracles.physics import regeneration_limit, slip, torque_limit
-from oracles.step import electrical_w
+from oracles.step import electrical_w, friction_coefficient
 
 LEAST_SLIP_SPEED = 0.3
 NOTHING = 1e-6
@@ -47,14 +47,59 @@ def grip(braking, road, wheel, speed, target, settings, axle):
     return max(-torque if braking else torque, 0.0)
 
 
-def keeps_slip(braking, wheel, m, settings, vehicle):
-    """Whether a wheel slips although it is given, and takes, less than a twentieth of its share of the weight."""
+def at_least(i, before, vehicle, near):
+    """Torque that the road takes at least from a wheel if it is the one that the others run over; `near` an edge."""
+    chassis = vehicle.chassis
+    axles = (vehicle.front, vehicle.front, vehicle.rear, vehicle.rear)
+    length = chassis.front_axle_to_cg_m + chassis.rear_axle_to_cg_m
+    pushed = sum(wheel.road_nm / axle.wheel.radius_m for wheel, axle in zip(before, axles, strict=True))
+    shares = (chassis.rear_axle_to_cg_m, chassis.front_axle_to_cg_m)
+    forces = [share * chassis.mass_kg * 9.81 for share in shares]
+    forces = [forces[0] - chassis.cg_height_m * pushed, forces[1] + chassis.cg_height_m * pushed]
+    loads = [max(force / 2.0 / length, 0.05 * chassis.mass_kg * 9.81) for force in forces for _ in range(2)]
+    slips = [abs(wheel.slip) for wheel in before]
+    used = [
+        min(
+            abs(before[k].road_nm) / loads[k] / axles[k].wheel.radius_m,
+            friction_coefficient(slips[k], 1.2, axles[k].tyre),
+        )
+        for k in range(4)
+    ]
+    beside, along, across = i ^ 1, i ^ 2, i ^ 3
+    whole = before[i].gated
+    found = used[along] * (min(slips[i] / slips[along], 1.0) if slips[along] > 0.0 else 1.0) * (1.0 if whole else 0.6)
+    edges = (
+        (used[along], 0.5 * used[i]),
+        (used[along], 0.8 * used[across]),
+        (slips[across], 0.8 * slips[along]),
+    )
+    near |= {abs(x - y) <= 1e-9 * max(x, y) for x, y in edges}
+    if used[along] > 0.5 * used[i] and all(x >= y for x, y in edges):
+        steeper = slips[beside] / slips[across] if 0.0 < slips[across] < slips[beside] else 1.0
+        found = max(found, min(used[beside], used[across] * steeper / 0.6) * (1.0 if whole else 0.8))
+    return found * loads[i] * axles[i].wheel.radius_m
+
+
+def keeps_slip(braking, wheels, i, m, before, settings, vehicle):
+    """Whether a wheel slips with next to no torque: with less than a twentieth of its share of the weight, or, alone of
+    its axle, with less than the road gives the others.
+    """
     if not (braking or (settings.gate_driving and m.power_demand_w > 0.0)):
         return False
+    wheel, other = wheels[i], wheels[i ^ 1]
     radius = wheel.axle.wheel.radius_m
-    slipped = m.speed_mps - radius * wheel.speed if braking else radius * wheel.speed - m.speed_mps
+    slipped = abs(m.speed_mps - radius * wheel.speed)
+    slower = m.speed_mps > radius * wheel.speed
+    more = radius * (other.speed - wheel.speed) * (1.0 if braking else -1.0)
+    held = 0.02 * m.speed_mps + 0.1
     little = 0.05 * vehicle.chassis.mass_kg * 9.81 / 4.0 * radius
-    return wheel.grip < little and abs(wheel.road) < little and slipped > 0.02 * m.speed_mps + 0.1
+    near = set()
+    if more > held:
+        little = max(little, at_least(i, before, vehicle, near))
+    largest = max(wheel.grip, abs(wheel.road))
+    edges = ((largest, little), (slipped, held), (more, held))
+    wheel.doubtful |= any(near) or any(abs(x - y) <= 1e-9 * max(abs(x), abs(y)) for x, y in edges)
+    return largest < little and slower == braking and slipped > held
 
 
 def yaw_speed_factor(speed, settings):
@@ -261,8 +306,8 @@ def step(m, state, settings, vehicle, decide):
         share = memory.applied_share + min(max(decided - memory.applied_share, -most), most)
 
     floor = vehicle.driver.power_speed_floor_mps
-    for axle in axles:
-        for wheel in axle.wheels:
+    for k, axle in enumerate(axles):
+        for i, wheel in enumerate(axle.wheels, start=2 * k):
             own = axle.slip if settings.gate_mode == GATE_MODE_TABLE2 else wheel.slip
             edge = settings.critical_slip - (settings.gate_hysteresis if wheel.before.gated else 0.0)
             wheel.doubtful = abs(abs(own) - edge) < 1e-12
@@ -277,7 +322,7 @@ def step(m, state, settings, vehicle, decide):
             wheel.room = brake if braking else torque_limit(wheel.fast, wheel.before.heat, wheel.axle.motor)
             if settings.gate_mode == GATE_MODE_LIMITER:
                 wheel.grip = grip(braking, wheel.road, wheel.speed, m.speed_mps, wheel.target, settings, wheel.axle)
-                wheel.gated |= keeps_slip(braking, wheel, m, settings, vehicle)
+                wheel.gated |= keeps_slip(braking, wheels, i, m, state.wheels, settings, vehicle)
             wheel.own = wheel.most = 0.0 if wheel.gated else min(wheel.room, wheel.grip)
         geometry = axle.wheels[0].axle
         mosts = [wheel.most for wheel in axle.wheels]

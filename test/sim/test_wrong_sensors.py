@@ -147,6 +147,23 @@ def test_a_wheel_that_shows_a_slip_it_does_not_have_takes_its_neighbours_no_brak
     it_brakes(speed_mps, power_w, 0.9, (broken,))
 
 
+@pytest.mark.parametrize(
+    ("speed_mps", "power_w", "broken"),
+    [
+        (6.53, 26.7e3, wrong("wheel_rear_right", "offset", -1.706, 0.0)),
+        (7.44, 8.84e3, wrong("wheel_rear_left", "factor", 0.896, 0.0)),
+        (13.35, 59e3, wrong("wheel_rear_right", "offset", -3.768, 0.3)),
+        (14.5, 37.5e3, wrong("wheel_rear_right", "offset", -1.397, 1.5)),
+        (14.3, 61.7e3, wrong("wheel_front_right", "factor", 0.924, 0.3)),
+        (7.8, 59.3e3, wrong("wheel_front_left", "offset", -1.662, 0.0)),
+        (30.3, 55.9e3, wrong("wheel_front_left", "offset", -4.859, 0.0)),
+    ],
+)
+def test_a_wheel_that_shows_a_slip_it_does_not_have_takes_no_brakes_at_the_limit(speed_mps, power_w, broken):
+    """The others run over the same road: it gets no torque until it comes back, and does not."""
+    it_brakes(speed_mps, power_w, 0.5, (broken,))
+
+
 @pytest.mark.parametrize("friction", [0.2, 0.5, 0.9])
 def test_a_speed_that_is_a_little_too_high_takes_no_brakes_for_good_at_the_limit(friction):
     """Slower, it looks like slip, until the torque is gone and the wheels do not come back: that lasted to the end."""
