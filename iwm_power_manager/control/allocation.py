@@ -165,7 +165,7 @@ def _commanded(
         brake_gain=state.motion.brake_gain,
         front_share=share,
         decided_share=memory.decided_share,
-        gate=front_gated + 2 * rear_gated,
+        gate=int(front_gated) + 2 * int(rear_gated),
         limits=limits,
         front_power_w=front.left.conversion_radps * fl_nm + front.right.conversion_radps * fr_nm,
         rear_power_w=rear.left.conversion_radps * rl_nm + rear.right.conversion_radps * rr_nm,

@@ -17,6 +17,7 @@ from iwm_power_manager.control import repeat
 from iwm_power_manager.control.execution import COMPILED, Execution, braked, plain_python
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.record import DECIDED_NAMES
+from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_power_manager.control.types import Measurement, initial_state
 from iwm_power_manager.interpreted import interpreted
@@ -95,6 +96,17 @@ def test_a_drive_is_bit_for_bit_the_same_compiled_and_in_plain_python_and_going_
     assert series([PLAIN] * len(steps), *rest) == compiled
     assert series([COMPILED if chosen else PLAIN for _, chosen in steps], *rest) == compiled
     assert not PLAIN.faults
+
+
+def test_a_flag_is_a_plain_integer_also_where_numpy_s_numbers_have_come_in() -> None:
+    # The rule's thresholds stand in an array; a message takes no integer of numpy's.
+    settings, car = default_settings("rule")._replace(gate_driving=True), CARS["drag"]
+    before, after = PLAIN.hold(initial_state()), PLAIN.hold(None)
+    for _ in range(3):
+        m = Measurement(1.0, (60.0, 20.0, 45.0, 20.0), 2000.0, 0.05, 0.9, 1e4, 1e4, 0.5)
+        command = PLAIN.advance(m, before, after, settings, PLAIN.hold(car), TABLE)[0]
+        before = PLAIN.hold(after.value)
+        assert [type(flags) for flags in (command.gate, command.gated_wheels, command.limits)] == [int, int, int]
 
 
 @given(any_of(0.0, 1.0), any_of(-60.0, 120.0) | st.just(math.nan), st.sampled_from(list(CARS.values())))
