@@ -6,6 +6,7 @@ from __future__ import annotations
 import fcntl
 import os
 import random
+import signal
 import tempfile
 from pathlib import Path
 from typing import IO
@@ -48,6 +49,10 @@ def _claim_domain() -> tuple[int, IO[str]]:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Set the environment before any module is imported; child processes inherit it."""
+    # What runs in a script's background, or under nohup, is born deaf to these, and so would be what tests interrupt.
+    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) == signal.SIG_IGN:
+            signal.signal(number, handler)
     domain, claim = _claim_domain()
     logs = tempfile.TemporaryDirectory(prefix="iwm-ros-log-")
     config.add_cleanup(claim.close)
