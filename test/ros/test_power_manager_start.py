@@ -150,7 +150,8 @@ def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, monkeypatch) -> None
 def test_services_are_answered_while_it_compiles(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("IWM_CACHE_DIR", str(tmp_path / "cache"))
     bench = Bench(namespace="/compiling")
-    running = Running(MODULE, arguments({"strategy": "equal"}, {"__ns": "/compiling"}), DOMAIN, tmp_path)
+    given = {"strategy": "equal", "lockstep": True}  # where it waits for the compiled law
+    running = Running(MODULE, arguments(given, {"__ns": "/compiling"}), DOMAIN, tmp_path)
     try:
         assert bench.lifecycle_state() == "unconfigured"
         assert bench.get_parameter("rate_hz") == 100.0
