@@ -103,8 +103,7 @@ class ActuatorState(NamedTuple):
     @property
     def all_dead(self) -> bool:
         """Whether no motor seems to give anything: one supply for all, or the reports."""
-        a, b, c, d = self.motors
-        return MotorVerdict.DEAD is a.verdict is b.verdict is c.verdict is d.verdict
+        return all(motor.verdict is MotorVerdict.DEAD for motor in self.motors)
 
     @property
     def gains(self) -> Wheels:
@@ -149,9 +148,10 @@ def judge(state: ActuatorState, reported_nm: Wheels, dt_s: float, limits: Actuat
         elif not state.reporting:
             return state
     a, b, c, d = (_judged(motor, *report, dt_s, limits) for motor, report in zip(state.motors, reports, strict=True))
-    if all(motor.verdict in (MotorVerdict.STUCK, MotorVerdict.REVERSED) for motor in (a, b, c, d)):
+    judged = ActuatorState((a, b, c, d), state.recent, True)
+    if all(motor.verdict in (MotorVerdict.STUCK, MotorVerdict.REVERSED) for motor in judged.motors):
         return ActuatorState(recent=state.recent)  # four motors do not get stuck at once: the reports did
-    return ActuatorState((a, b, c, d), state.recent, True)
+    return judged
 
 
 def _tolerance_nm(least_nm: float, most_nm: float, limits: ActuatorLimits) -> float:

@@ -131,9 +131,8 @@ def _commanded(
     """Steps 4 to 7: from the power each axle is asked for to the torques that are commanded."""
     demand, dt, wheels = measurement.power_demand_w, measurement.dt_s, state.wheels
     braking = demand < 0.0
-    front_gated = front.left.gated and front.right.gated
-    rear_gated = rear.left.gated and rear.right.gated
-    front_power, rear_power = gated_split(demand, share, front_gated, rear_gated)
+    gated = front.left.gated and front.right.gated, rear.left.gated and rear.right.gated
+    front_power, rear_power = gated_split(demand, share, gated)
     front_asked, rear_asked = abs(front_power), abs(rear_power)
     front_given, rear_given = allocate(front_asked, rear_asked, pair_capacity_w(front), pair_capacity_w(rear))
 
@@ -165,7 +164,7 @@ def _commanded(
         brake_gain=state.motion.brake_gain,
         front_share=share,
         decided_share=memory.decided_share,
-        gate=int(front_gated) + 2 * int(rear_gated),
+        gate=int(gated[0]) + 2 * int(gated[1]),
         limits=limits,
         front_power_w=front.left.conversion_radps * fl_nm + front.right.conversion_radps * fr_nm,
         rear_power_w=rear.left.conversion_radps * rl_nm + rear.right.conversion_radps * rr_nm,

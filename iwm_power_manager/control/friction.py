@@ -197,7 +197,7 @@ def estimate(
         side = SideGrip(prior, 0.0)
         return FrictionState(left=side, right=side, wheels=before.wheels, assumed=prior)
     a, b, c, d = before.wheels
-    left_front, right_front, left_rear, right_rear = 0.0, 0.0, 0.0, 0.0
+    left_front = right_front = left_rear = right_rear = 0.0
     front, rear = vehicle.front, vehicle.rear
     if believed and speed_mps > SLOWEST_MPS:
         torque = wheels[0].road_nm + wheels[1].road_nm

@@ -44,7 +44,7 @@ _IMU_OLDEST_S = 0.1
 #: Refused for what was accepted before, not for what they are.
 _REFUSED_BY_ANOTHER = (Violation.TOO_FAST, Violation.STAMP_NOT_NEWER)
 #: Refused for its values.
-_OF_VALUES = (Violation.OUT_OF_RANGE, Violation.NOT_FINITE, Violation.AXLE_LOST, Violation.LENGTH)
+_OF_VALUES = {Violation.OUT_OF_RANGE, Violation.NOT_FINITE, Violation.AXLE_LOST, Violation.LENGTH}
 #: Refused for its time.
 _OF_STAMPS = (Violation.STAMP_TOO_OLD, Violation.STAMP_IN_FUTURE, Violation.LATE)
 #: No message is that long on its way; a stamp of 0 is that old.

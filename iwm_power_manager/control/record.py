@@ -151,8 +151,7 @@ YOUNGER_SIGNALS = (
     | {f"{wheel}_brake_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_stuck_nm": 0.0 for wheel in WHEEL_NAMES}
-    | {f"{side}_friction": 0.0 for side in ("left", "right")}
-    | {f"{side}_friction_confidence": 0.0 for side in ("left", "right")}
+    | {"left_friction": 0.0, "right_friction": 0.0, "left_friction_confidence": 0.0, "right_friction_confidence": 0.0}
 )
 _YOUNGER = YOUNGER_SIGNALS | {_SETTING + name: float(value) for name, value in DEFAULTS._asdict().items()}
 

@@ -21,9 +21,11 @@ from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.pedals import PEDAL_TRAVEL, demand_power_w
 from iwm_power_manager.model.top_speed import motor_power_w, top_speed_mps
 
-#: More than this many times what the car's own pedals ask for is no demand; so many times its top speed no car does
-#: downhill, so many times rolling no wheel without grip, and so many times what its torques make of a wheel nothing.
-_BEYOND_PEDALS, _BEYOND_TOP_SPEED, _BEYOND_ROLLING, _BEYOND_TORQUE = 1.5, 1.2, 1.5, 2.0
+#: More than this many times what the car's own pedals ask for is no demand.
+_BEYOND_PEDALS = 1.5
+#: So many times its top speed no car does downhill, so many times rolling no wheel without grip, and so many times what
+#: its torques make of a wheel nothing.
+_BEYOND_TOP_SPEED, _BEYOND_ROLLING, _BEYOND_TORQUE = 1.2, 1.5, 2.0
 _INF = math.inf
 
 

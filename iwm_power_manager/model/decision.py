@@ -231,8 +231,8 @@ def given(
     """Torques of a dynamic step at a state under a front share, after gate and limits."""
     battery = vehicle.battery
     floor = vehicle.driver.power_speed_floor_mps
-    gate_front, gate_rear = axles_gated(power_demand_w, slip_front, slip_rear, problem)
-    power_front, power_rear = gated_split(power_demand_w, front_share, gate_front, gate_rear)
+    gated = axles_gated(power_demand_w, slip_front, slip_rear, problem)
+    power_front, power_rear = gated_split(power_demand_w, front_share, gated)
     front_speed = wheel_speed_of_state(slip_front, speed_mps, vehicle.front)
     rear_speed = wheel_speed_of_state(slip_rear, speed_mps, vehicle.rear)
 

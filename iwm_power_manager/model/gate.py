@@ -28,8 +28,9 @@ def axle_gated(slip: float, power_w: float, was_gated: bool, critical: float, hy
 
 
 @kernel
-def gated_split(power_w: float, front_share: float, front_gated: bool, rear_gated: bool) -> tuple[float, float]:
+def gated_split(power_w: float, front_share: float, gated: tuple[bool, bool]) -> tuple[float, float]:
     """Power of the front and the rear axle, W, under Table 2: a gated axle's part goes to the other one."""
+    front_gated, rear_gated = gated
     if front_gated and rear_gated:
         return 0.0, 0.0
     if front_gated:

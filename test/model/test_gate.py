@@ -49,11 +49,11 @@ def test_a_gated_axle_stays_so_until_its_slip_is_inside_by_the_hysteresis(sign, 
     ],
 )
 def test_a_gated_axle_s_power_goes_to_the_other_one(front, rear, split):
-    assert gated_split(-1000.0, 0.3, front, rear) == pytest.approx(split)
+    assert gated_split(-1000.0, 0.3, (front, rear)) == pytest.approx(split)
 
 
 @given(st.floats(-1e6, 1e6), st.floats(0.0, 1.0))
 def test_ungated_parts_sum_to_the_whole(power, share):
-    front, rear = gated_split(power, share, False, False)
+    front, rear = gated_split(power, share, (False, False))
     assert front == share * power
     assert front + rear == pytest.approx(power)
