@@ -7,13 +7,17 @@ Cosmic Ray has no such change, and it is the likeliest mistake in a law that cou
 - a constant index of a wheel or an axle (0 to 3), for the wheel beside it and for the one behind it;
 - two elements of a tuple, or two arguments of a call, that name the two sides of the same thing;
 - two of the four elements of a tuple in the order of the wheels: of one axle, or of one side.
+
+What is the same by construction is no change: two arguments that a function of the module uses in sums, products,
+minima and maxima alone, where their order says nothing.
 """
 
 from __future__ import annotations
 
 import ast
+import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 #: Part of a name -> the same of the other side.
 _ACROSS = {"left": "right", "right": "left", "fl": "fr", "fr": "fl", "rl": "rr", "rr": "rl"}
@@ -83,6 +87,44 @@ def _pairs(text: _Text, elements: list[ast.expr], wheels: bool) -> Iterator[tupl
                 yield one, other
 
 
+class _Ordered(ast.NodeTransformer):
+    """Puts what has no order into one, under other names if need be."""
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        self._names = names
+
+    def visit_Name(self, node: ast.Name) -> ast.AST:
+        return ast.Name(self._names.get(node.id, node.id), node.ctx)
+
+    def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
+        self.generic_visit(node)
+        if isinstance(node.op, ast.Add | ast.Mult):
+            node.left, node.right = sorted((node.left, node.right), key=ast.dump)
+        return node
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        self.generic_visit(node)
+        if isinstance(node.func, ast.Name) and node.func.id in _EITHER_WAY:
+            node.args.sort(key=ast.dump)
+        return node
+
+
+def _ordered(source: str, names: Mapping[str, str]) -> list[str]:
+    return [ast.dump(_Ordered(names).visit(node)) for node in ast.parse(source).body]
+
+
+def _without_order(tree: ast.Module) -> set[tuple[str, int, int]]:
+    """Functions with two parameters that may be exchanged: name, and which two."""
+    found = set()
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef):
+            body, names = "\n".join(map(ast.unparse, node.body)), [argument.arg for argument in node.args.args]
+            for (i, one), (j, other) in itertools.combinations(enumerate(names), 2):
+                if other in _other_names(one) and _ordered(body, {}) == _ordered(body, {one: other, other: one}):
+                    found.add((node.name, i, j))
+    return found
+
+
 def _is_shape(node: ast.expr) -> bool:
     return isinstance(node, ast.Attribute) and node.attr == "shape"
 
@@ -90,7 +132,7 @@ def _is_shape(node: ast.expr) -> bool:
 def swaps_of(source: str) -> list[str]:
     """The source with one swap each, in the order of their places."""
     text = _Text(source)
-    known = _known_names(text.tree)
+    known, either_way = _known_names(text.tree), _without_order(text.tree)
     # What is only asked for membership has no order.
     unordered = {
         id(part)
@@ -114,5 +156,10 @@ def swaps_of(source: str) -> list[str]:
         elif isinstance(node, ast.Tuple):
             found += [text.exchanged(*pair) for pair in _pairs(text, node.elts, len(node.elts) == _WHEELS)]
         elif isinstance(node, ast.Call) and text.of(node.func) not in _EITHER_WAY:
-            found += [text.exchanged(*pair) for pair in _pairs(text, node.args, False)]
+            function, places = text.of(node.func), {id(argument): i for i, argument in enumerate(node.args)}
+            found += [
+                text.exchanged(one, other)
+                for one, other in _pairs(text, node.args, False)
+                if (function, places[id(one)], places[id(other)]) not in either_way
+            ]
     return found
