@@ -9,10 +9,10 @@ then.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -23,11 +23,20 @@ from iwm_power_manager.ros.diagnostics import ERROR, OK, WARN, Status
 #: The child gives way to whatever else runs on the machine.
 NICE = 10
 
-_CHILD = """\
-import json, sys
+#: What it does first makes it an ordinary process that gives way to others, in memory, too, and ends it with the node.
+_CHILD = f"""\
+import contextlib, json, os, sys, threading
+os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as first_to_go:
+    first_to_go.write("1000")
+os.nice({NICE})
+def end_with_the_node():
+    os.read(0, 1)  # nothing is ever written: it returns when nobody can write any more
+    os._exit(1)
+threading.Thread(target=end_with_the_node, daemon=True).start()
 sys.path[:], values = map(json.loads, sys.argv[1:])
-from iwm_power_manager.nodes import compiling
-compiling.compile_and_end(values)
+from iwm_power_manager.nodes.preparation import prepare
+prepare(values, at_once=False)
 """
 
 
@@ -48,20 +57,29 @@ class Compiling:
     def __init__(self, values: Mapping[str, Any], load: Callable[[], None]) -> None:
         self.ended = False
         self.problem = ""
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _CHILD, json.dumps(sys.path), json.dumps(dict(values), default=list)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            process_group=0,  # Ctrl-C is the node's affair
-        )
-        threading.Thread(target=self._wait, args=(load,), name="compiling", daemon=True).start()
-
-    def _wait(self, load: Callable[[], None]) -> None:
-        assert self._process.stderr is not None
-        said = self._process.stderr.read().decode(errors="replace").strip().splitlines()
+        self._began_s = time.monotonic()
+        self._process: subprocess.Popen[bytes] | None = None
+        optimised = ["-O"] * sys.flags.optimize  # other code, by another name in the cache
+        given = json.dumps(sys.path), json.dumps(dict(values), default=list)
         try:
-            if code := self._process.wait():
+            self._process = subprocess.Popen(
+                [sys.executable, *optimised, "-c", _CHILD, *given],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                process_group=0,  # Ctrl-C is the node's affair
+            )
+            threading.Thread(target=self._wait, args=(self._process, load), name="compiling", daemon=True).start()
+        except Exception as error:  # noqa: BLE001 - no process, thread, memory or Python: it drives all the same
+            self.stop()
+            self.problem = one_line(f"no process can compile it: {error}")
+            self.ended = True
+
+    def _wait(self, process: subprocess.Popen[bytes], load: Callable[[], None]) -> None:
+        assert process.stderr is not None
+        said = process.stderr.read().decode(errors="replace").strip().splitlines()
+        try:
+            if code := process.wait():
                 how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
                 raise IwmError(f"the process that compiles {how}")
             load()
@@ -71,7 +89,13 @@ class Compiling:
 
     def stop(self) -> None:
         """End the child process, if it has not ended."""
-        self._process.kill()
+        if self._process:
+            self._process.kill()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since it began."""
+        return time.monotonic() - self._began_s
 
 
 def law_status(execution: Execution, compiling: Compiling | None) -> Status:
@@ -80,20 +104,9 @@ def law_status(execution: Execution, compiling: Compiling | None) -> Status:
         return Status("law", OK, "compiled", {})
     if execution.faults:
         return Status("law", ERROR, f"friction brakes alone where it fails: {'; '.join(execution.faults)}", {})
-    until = compiling.problem if compiling and compiling.problem else "until a process of its own has compiled it"
-    return Status("law", WARN, f"plain Python, the power split equally, {until}", {})
-
-
-def compile_and_end(values: Mapping[str, Any]) -> None:
-    """What the child process does: prepare as the node does, and nothing but that."""
-    threading.Thread(target=_end_with_the_node, daemon=True).start()
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    os.nice(NICE)
-    from iwm_power_manager.nodes.preparation import prepare
-
-    prepare(values, at_once=False)
-
-
-def _end_with_the_node() -> None:
-    os.read(0, 1)  # nothing is ever written: it returns when nobody can write any more
-    os._exit(1)
+    until, values = "until a process of its own has compiled it", {}
+    if compiling and compiling.problem:
+        until = compiling.problem
+    elif compiling:
+        values["compiling for, s"] = f"{compiling.elapsed_s:.0f}"
+    return Status("law", WARN, f"plain Python, the power split equally, {until}", values)

@@ -432,7 +432,7 @@ class PowerManager(Starting):
             controller.brake_gain,
         )
         gate = controller and controller.command and controller.command.gate
-        law = controller and law_status(controller.execution, self._compiling)
+        law = controller and law_status(controller.execution, self._compiling).message
         if self._changes.changed((self._active, self._fault, shown, gate, law), time.monotonic()):
             self._report_soon(stepping)
 

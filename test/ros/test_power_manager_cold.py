@@ -15,20 +15,25 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from iwm_power_manager.control.strategies import STRATEGIES
 
+ROOT = Path(__file__).resolve().parents[2]
 EQUAL, CHOSEN = (STRATEGIES[name].code for name in ("equal", "sdp_lookahead"))
 
 
 @pytest.fixture
 def cold(start_own: Callable[..., Any], tmp_path: Path) -> Any:
-    """A power manager whose kernel cache is empty, with its bench."""
-    parameters = {"strategy": "sdp_lookahead", "policy_file": "policies"}
-    return start_own(parameters, environment={"IWM_CACHE_DIR": str(tmp_path / "cache")})
+    """A power manager whose kernel cache is empty, with its bench; on a busy machine, too, it drives at once and on."""
+    parameters = {"strategy": "sdp_lookahead", "policy_file": "policies", "rate_hz": 10.0, "missed_periods": 100}
+    patient = {"own_gap_s": 60.0, "clock_stopped_s": 60.0, "command_oldest_s": 1.0}
+    folders = {"IWM_CACHE_DIR": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}
+    return start_own(parameters | patient, environment=folders)
 
 
 def child_of(pair: Any) -> psutil.Process:
-    """The process that compiles, once there is one."""
+    """The process that compiles, once there is one; stopped, so that it does not end before a test wants it to."""
     node = psutil.Process(pair.running.process.pid)
-    return pair.bench.spin_until(node.children, "a process that compiles")[0]
+    child = pair.bench.spin_until(node.children, "a process that compiles")[0]
+    child.suspend()
+    return child
 
 
 def law(bench: Bench) -> tuple[bytes, str]:
@@ -44,11 +49,13 @@ def drives(bench: Bench) -> bool:
 def test_it_drives_before_the_law_is_compiled_and_goes_over_without_a_break(cold) -> None:
     bench, child = cold.bench, child_of(cold)
     bench.drive(lambda: drives(bench) and law(bench)[0] == DiagnosticStatus.WARN, "torque and a report")
-    assert child.is_running()
-    assert child.nice() > psutil.Process(cold.running.process.pid).nice()
     assert "plain Python" in law(bench)[1]
     assert bench.last("setting.strategy") == EQUAL
     first = len(bench.states) - 1
+    child.resume()
+    nice = psutil.Process(cold.running.process.pid).nice()
+    bench.drive(lambda: child.nice() > nice, "a process that gives way")
+    assert Path(f"/proc/{child.pid}/oom_score_adj").read_text() == "1000\n"
     bench.drive(
         lambda: law(bench) == (DiagnosticStatus.OK, "compiled"), "the compiled law", patience_s=5.0 * PATIENCE_S
     )
@@ -80,9 +87,26 @@ def test_where_the_child_process_is_killed_it_says_so_and_goes_on_without(cold) 
 def test_however_the_node_ends_the_child_process_ends_with_it(cold, sent) -> None:
     child = child_of(cold)
     cold.bench.drive(lambda: drives(cold.bench), "torque")
-    assert child.is_running()
+    assert child.status() == psutil.STATUS_STOPPED
+    child.resume()
     cold.running.stop(sent)
     child.wait(PATIENCE_S)
+
+
+def test_for_how_long_it_has_been_compiling_is_said(cold) -> None:
+    bench = cold.bench
+    child_of(cold)  # which hangs
+    said = bench.drive(lambda: [v for s in [bench.status("law")] if s for v in s.values if int(v.value) > 0], "seconds")
+    assert [value.key for value in said] == ["compiling for, s"]
+
+
+def test_where_no_process_can_be_started_it_drives_all_the_same(start_own, tmp_path) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import sys; sys.executable = ''")  # as in a program that embeds Python
+    folders = {"IWM_CACHE_DIR": str(tmp_path / "cache"), "TMPDIR": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    pair = start_own({"rate_hz": 10.0, "missed_periods": 100, "own_gap_s": 60.0}, environment=folders)
+    bench = pair.bench
+    bench.drive(lambda: drives(bench) and "no process can compile it: [Errno" in law(bench)[1], "torque and the reason")
+    assert law(bench)[0] == DiagnosticStatus.WARN
 
 
 def test_cleaned_up_it_compiles_no_more(cold) -> None:
@@ -90,4 +114,4 @@ def test_cleaned_up_it_compiles_no_more(cold) -> None:
     bench.spin_until(lambda: bench.lifecycle_state() == "active", "active")
     assert bench.change_state("deactivate")
     assert bench.change_state("cleanup")
-    child.wait(PATIENCE_S)
+    child.wait(PATIENCE_S)  # stopped as it is: it is ended, and does not end by itself
