@@ -8,6 +8,8 @@ so that it cannot pass for a point of the grid.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from iwm_power_manager.jit import kernel
 
 
@@ -104,3 +106,41 @@ def interpolate5(table, a, fa, b, fb, c, fc, d, fd, e, fe):
     if _at_end(fa):
         return low
     return low + fa * (interpolate4(table[min(a + 1, table.shape[0] - 1)], b, fb, c, fc, d, fd, e, fe) - low)
+
+
+class Ends(NamedTuple):
+    """A cell of `locate` by the indices of its ends: `low`, where the fraction of the way to `high` is 0, or below."""
+
+    low: int
+    high: int
+    fraction: float
+
+
+@kernel
+def ends(axis, x):
+    """Cell of `x` on an axis, as `interpolate3_of_5` needs it; the fraction is below 1, or NaN."""
+    i, fraction = locate(axis, x)
+    high = min(i + 1, axis.size - 1)
+    return Ends(high, high, 0.0) if fraction == 1.0 else Ends(i, high, fraction)
+
+
+@kernel
+def interpolate3_of_5(table, a, b, c, d, e):
+    """Trilinear value of table[A, B, c, d, E] at the ends a, b, e; c and d are indices.
+
+    `interpolate5` at the points c and d, to the bit, without its slices: they take longer than the arithmetic.
+    """
+    low = _of_two(table, a.low, b, c, d, e)
+    return low if a.fraction == 0.0 else low + a.fraction * (_of_two(table, a.high, b, c, d, e) - low)
+
+
+@kernel
+def _of_two(table, a, b, c, d, e):
+    low = _of_one(table, a, b.low, c, d, e)
+    return low if b.fraction == 0.0 else low + b.fraction * (_of_one(table, a, b.high, c, d, e) - low)
+
+
+@kernel
+def _of_one(table, a, b, c, d, e):
+    low = table[a, b, c, d, e.low]
+    return low if e.fraction == 0.0 else low + e.fraction * (table[a, b, c, d, e.high] - low)

@@ -72,6 +72,22 @@ def test_interpolation_agrees_with_scipy_inside_and_holds_the_edge_outside(dimen
         assert INTERPOLATE[dimensions](table, *cells) == pytest.approx(reference(inside)[0], abs=1e-9)
 
 
+@given(data=st.data())
+def test_interpolation_without_slices_has_the_same_bits(data):
+    points = [data.draw(axes(most=4)) for _ in range(5)]
+    shape = [axis.size for axis in points]
+    table = np.random.default_rng(data.draw(st.integers(0, 1000))).normal(size=shape)
+    c, d = (data.draw(st.integers(0, size - 1)) for size in shape[2:4])
+    x = {}
+    for axis in (0, 1, 4):
+        edges = st.sampled_from([*points[axis], math.nan])
+        x[axis] = data.draw(edges | st.floats(points[axis][0] - 1.0, points[axis][-1] + 1.0))
+    a, b, e = (grid.ends(points[axis], value) for axis, value in x.items())
+    cells = [grid.locate(points[axis], x.get(axis, points[axis][k])) for axis, k in enumerate((0, 0, c, d, 0))]
+    expected = grid.interpolate5(table, *[number for cell in cells for number in cell])
+    assert np.float64(grid.interpolate3_of_5(table, a, b, c, d, e)).tobytes() == np.float64(expected).tobytes()
+
+
 def test_axes_of_one_point_do_not_matter():
     table = np.arange(3.0).reshape(1, 3, 1, 1, 1)
     single = np.zeros(1)

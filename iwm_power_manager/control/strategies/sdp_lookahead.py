@@ -15,7 +15,7 @@ from iwm_power_manager.control.persistence import SAMPLES, demand_ago, held_s, r
 from iwm_power_manager.control.strategies.instantaneous import LEAST_DIFFERENCE_W
 from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import PolicyTable
-from iwm_power_manager.grid import interpolate5, locate
+from iwm_power_manager.grid import Ends, ends, interpolate3_of_5
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.decision import SLIP_QUASI_STEADY, Settled, settled, settled_step, step_cost_and_next
 from iwm_power_manager.model.parameters import VehicleParams
@@ -33,8 +33,6 @@ TRUST = 0.5
 #: For the rest a rule of thumb counts: what is better now stays so for this long, s.
 WORTH_S = 0.8
 
-Cell = tuple[int, float]  # as `locate` gives it
-
 #: From this gain on a demand counts as it is: averaging would change nothing that matters.
 _LASTING = 0.99
 #: Part of a cost that sums and products may lose.
@@ -48,11 +46,11 @@ class _Ahead(NamedTuple):
     """
 
     settled: Settled
-    power: Cell
-    earlier: Cell
-    speed: Cell
-    slip_front: Cell
-    slip_rear: Cell
+    power: Ends
+    earlier: Ends
+    speed: Ends
+    slip_front: Ends
+    slip_rear: Ends
 
 
 @kernel
@@ -62,11 +60,11 @@ def _ahead(
     before = settled(power_demand_w, situation.speed_mps, vehicle, policy.problem)
     return _Ahead(
         before,
-        locate(policy.power_w, power_demand_w),
-        locate(policy.power_w, earlier_w),
-        locate(policy.speed_mps, before.speed_mps),
-        locate(policy.slip_front, 0.0),
-        locate(policy.slip_rear, 0.0),
+        ends(policy.power_w, power_demand_w),
+        ends(policy.power_w, earlier_w),
+        ends(policy.speed_mps, before.speed_mps),
+        ends(policy.slip_front, 0.0),
+        ends(policy.slip_rear, 0.0),
     )
 
 
@@ -77,12 +75,12 @@ def _half_believed(power_demand_w: float, situation: Situation, vehicle: Vehicle
 
 
 @kernel
-def _cell_of(k: int, share: float, policy: PolicyTable) -> Cell:
+def _cell_of(k: int, share: float, policy: PolicyTable) -> Ends:
     """Where a share, perhaps the k-th, lies among the previous shares, which mostly are the same ones."""
     axis = policy.previous_share
     if 0 <= k < axis.size and axis[k] == share:
-        return k, 0.0
-    return locate(axis, share)
+        return Ends(k, k, 0.0)
+    return ends(axis, share)
 
 
 class _Outlook(NamedTuple):
@@ -118,7 +116,7 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
     ahead = _ahead(demand_w, earlier_w, situation, vehicle, policy)
     # Each kernel is called in one place, so that the compiler puts it there: a car and a policy are much to pass on.
     best, most = previous, 0.0
-    kept = _Outlook(0.0, 0.0, 0.0)
+    kept = found = _Outlook(0.0, 0.0, 0.0)
     worth = 0.0
     for k in range(-1, policy.share.size):
         share, switching = previous, LEAST_DIFFERENCE_W * policy.problem.dt_s
@@ -129,12 +127,14 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
                 continue
             switching += price * (price_units(move) if budgeted else abs(move)) + policy.switching_fixed_cost_j
         cell = _cell_of(k, share, policy)
+        bound = False
         # Most shares are worth less than the best so far for certain, before anything is solved for them.
         for least in (k >= 0 and policy.problem.slip_model == SLIP_QUASI_STEADY, False):
-            found = _outlook(ahead, situation, share, cell, least, level, vehicle, policy)
+            found = _outlook(ahead, situation, share, cell, least, bound, found, level, vehicle, policy)
             if k < 0:
                 kept = found
                 break
+            bound = least
             step = kept.step_j - found.step_j
             later = policy.discount * (kept.later_j - found.later_j)
             earlier = policy.discount * (kept.earlier_j - found.earlier_j)
@@ -155,8 +155,10 @@ def _outlook(
     ahead: _Ahead,
     situation: Situation,
     share: float,
-    cell: Cell,
+    cell: Ends,
     least: bool,
+    bound: bool,
+    found: _Outlook,
     level: float,
     vehicle: VehicleParams,
     policy: PolicyTable,
@@ -171,14 +173,16 @@ def _outlook(
         if i >= 0:
             demand_w = situation.jitter.samples_w[i]
             ahead = _ahead(demand_w, demand_w, situation, vehicle, policy)
-        found = _demand_outlook(ahead, demand_w, situation, share, cell, least, level, vehicle, policy)
+        one = _demand_outlook(ahead, demand_w, situation, share, cell, least, bound, found, level, vehicle, policy)
         if gain > _LASTING:
-            return found
-        step += weight * found.step_j
-        later += weight * found.later_j
-        earlier += weight * found.earlier_j
+            return one
+        step += weight * one.step_j
+        later += weight * one.later_j
+        earlier += weight * one.earlier_j
         weights += weight
         weight *= 1.0 - gain
+    if bound:
+        return _Outlook(step / weights, found.later_j, found.earlier_j)
     return _Outlook(step / weights, later / weights, earlier / weights)
 
 
@@ -188,44 +192,56 @@ def _demand_outlook(
     power_demand_w: float,
     situation: Situation,
     share: float,
-    cell: Cell,
+    cell: Ends,
     least: bool,
+    bound: bool,
+    found: _Outlook,
     level: float,
     vehicle: VehicleParams,
     policy: PolicyTable,
 ) -> _Outlook:
     """Right-hand side of eq. 31 for one demand and one share, without the price of the change.
 
-    `cell` is the share's among the previous shares; `least` asks for a bound, never larger but for rounding.
+    `cell` is the share's among the previous shares; `least` asks for a bound, never larger but for rounding. What
+    follows is that of `found` where there has been a `bound`: there, slip is settled, it is the same.
     """
     speed, problem = situation.speed_mps, policy.problem
-    b, fb = ahead.speed
-    c, fc = ahead.slip_front
-    d, fd = ahead.slip_rear
-    e, fe = cell
+    end, front, rear = ahead.speed, ahead.slip_front, ahead.slip_rear
     if problem.slip_model == SLIP_QUASI_STEADY:
         outcome = settled_step(ahead.settled, power_demand_w, speed, share, least, vehicle, problem)
+        if bound:
+            return _Outlook(outcome.cost_j, found.later_j, found.earlier_j)
     else:
         outcome = step_cost_and_next(
             power_demand_w, speed, situation.front_slip, situation.rear_slip, share, vehicle, problem
         )
-        b, fb = locate(policy.speed_mps, outcome.speed_mps)
-        c, fc = locate(policy.slip_front, outcome.slip_front)
-        d, fd = locate(policy.slip_rear, outcome.slip_rear)
-    later = expected = 0.0
-    for i in range(1 if ahead.earlier == ahead.power else 2):
-        a, fa = ahead.power if i == 0 else ahead.earlier
-        if level <= 0.0:
-            expected = interpolate5(policy.expected_cost_j, a, fa, b, fb, c, fc, d, fd, e, fe)
-        else:
-            upper = min(int(level), policy.dearer_cost_j.shape[0] - 1)
-            low = policy.expected_cost_j if upper == 0 else policy.dearer_cost_j[upper - 1]
-            expected = interpolate5(low, a, fa, b, fb, c, fc, d, fd, e, fe)
-            high = interpolate5(policy.dearer_cost_j[upper], a, fa, b, fb, c, fc, d, fd, e, fe)
-            expected += (level - upper) * (high - expected)
-        if i == 0:
-            later = expected
-    return _Outlook(outcome.cost_j, later, expected)
+        end = ends(policy.speed_mps, outcome.speed_mps)
+        front = ends(policy.slip_front, outcome.slip_front)
+        rear = ends(policy.slip_rear, outcome.slip_rear)
+    later = earlier = 0.0
+    for corner in range(4):
+        c, weight = (front.high, front.fraction) if corner & 1 else (front.low, 1.0 - front.fraction)
+        d, part = (rear.high, rear.fraction) if corner & 2 else (rear.low, 1.0 - rear.fraction)
+        weight *= part
+        if weight == 0.0:
+            continue
+        expected = _expected_j(ahead.power, end, c, d, cell, level, policy)
+        later += weight * expected
+        if ahead.earlier != ahead.power:
+            expected = _expected_j(ahead.earlier, end, c, d, cell, level, policy)
+        earlier += weight * expected
+    return _Outlook(outcome.cost_j, later, earlier)
+
+
+@kernel
+def _expected_j(power: Ends, speed: Ends, c: int, d: int, share: Ends, level: float, policy: PolicyTable) -> float:
+    """Expected cost-to-go at the c-th front and the d-th rear slip, at the price of this level."""
+    if level <= 0.0:
+        return interpolate3_of_5(policy.expected_cost_j, power, speed, c, d, share)
+    upper = min(int(level), policy.dearer_cost_j.shape[0] - 1)
+    below = policy.expected_cost_j if upper == 0 else policy.dearer_cost_j[upper - 1]
+    low = interpolate3_of_5(below, power, speed, c, d, share)
+    return low + (level - upper) * (interpolate3_of_5(policy.dearer_cost_j[upper], power, speed, c, d, share) - low)
 
 
 STRATEGY = Strategy("sdp_lookahead", 5, choose, needs_policy=True)
