@@ -44,6 +44,7 @@ from iwm_power_manager.ros.intake import Intake
 from iwm_power_manager.ros.interruption import Interruption
 from iwm_power_manager.ros.parameters import Change, Spec, declare
 from iwm_power_manager.share import resolve
+from iwm_power_manager.tools.progress import show_compiling
 from iwm_power_manager.vehicle import load_vehicle
 from iwm_sim.drive import Drive, save_run
 from iwm_sim.pacing import FRICTION, MOTOR, Exchange, NoAnswerError, Pacer
@@ -464,6 +465,7 @@ def main(args: Sequence[str] | None = None) -> int:
         )
         # rclpy's own handlers would close DDS under a callback that is publishing.
         rclpy.init(args=list(args) if args is not None else None, signal_handler_options=SignalHandlerOptions.NO)
+        show_compiling()
         node = Simulator()
         check_parameter_files(sys.argv if args is None else list(args), node.get_fully_qualified_name())
         executor = SingleThreadedExecutor()

@@ -6,6 +6,8 @@ from __future__ import annotations
 import math
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -391,6 +393,28 @@ def test_topics_follow_namespace_and_remaps(tmp_path, hill) -> None:
         running.process.kill()
         running.process.wait()
         onlooker.close()
+
+
+#: A simulator whose car has to be compiled.
+COMPILES = """
+import sys
+from iwm_power_manager import jit
+from iwm_power_manager.errors import IwmError
+from iwm_sim import simulator
+def compiling():
+    jit.watch.begin("iwm_sim.plant.advance", 3)
+    jit.watch.end()
+    raise IwmError("and so on")
+simulator.Simulator = compiling
+sys.exit(simulator.main([]))
+"""
+
+
+def test_a_simulator_that_has_to_compile_its_car_says_so() -> None:
+    done = subprocess.run([sys.executable, "-c", COMPILES], capture_output=True, text=True, check=False)
+    first, last = done.stderr.splitlines()
+    assert first.startswith("compiling for this machine")
+    assert last == "simulator: and so on"
 
 
 def test_the_shipped_parameter_file_holds_its_defaults() -> None:
