@@ -137,9 +137,9 @@ def step(
     e, f, g, h = after.wheels
     motor = made.motor_torque_nm
     friction = made.friction_torque_nm
-    a, b, c, d = before.wheels
+    w = before.wheels
     # Of a front and a rear wheel, as the mean of both sides.
-    motor_before = 0.5 * (a.motor_nm + b.motor_nm + c.motor_nm + d.motor_nm)
+    motor_before = 0.5 * (w[0].motor_nm + w[1].motor_nm + w[2].motor_nm + w[3].motor_nm)
     motor_now = 0.5 * (motor[0] + motor[1] + motor[2] + motor[3])
     hold = hold_torque_nm(state.hold_nm, motion, m, motor_now, motor_before, vehicle)
     if hold > 0.0 and demand >= 0.0:

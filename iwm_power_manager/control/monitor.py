@@ -336,7 +336,7 @@ class InputMonitor:
         self.verdicts = judged.verdicts
         if any(judged.verdicts):
             self.wheels_refused.update(
-                found for found in zip(self._wheel_names, judged.verdicts, strict=True) if found[1]
+                (name, verdict) for name, verdict in zip(self._wheel_names, judged.verdicts, strict=True) if verdict
             )
         if any(math.isnan(speed) for speed in judged.speed_radps):
             return tally.note(Violation.AXLE_LOST, reading.stamp_ns)

@@ -61,11 +61,10 @@ class Rolling(NamedTuple):
 
 @kernel
 def _pushed(t: Turning) -> float:
-    a, b, c, d = t.torque_nm
-    front_nm, rear_nm = ICE_FRICTION * t.front_nm, ICE_FRICTION * t.rear_nm
-    if min(a, b) >= front_nm and min(c, d) >= rear_nm:
+    nm, front_nm, rear_nm = t.torque_nm, ICE_FRICTION * t.front_nm, ICE_FRICTION * t.rear_nm
+    if min(nm[0], nm[1]) >= front_nm and min(nm[2], nm[3]) >= rear_nm:
         return 1.0
-    return -1.0 if max(a, b) <= -front_nm and max(c, d) <= -rear_nm else 0.0
+    return -1.0 if max(nm[0], nm[1]) <= -front_nm and max(nm[2], nm[3]) <= -rear_nm else 0.0
 
 
 @kernel

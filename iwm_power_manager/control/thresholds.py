@@ -17,7 +17,7 @@ from iwm_power_manager.control.monitor import InputLimits
 from iwm_power_manager.control.settings import Change, Setting
 from iwm_power_manager.control.supervision import SupervisionLimits
 from iwm_power_manager.interpreted import interpreted
-from iwm_power_manager.model.parameters import VehicleParams
+from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.model.pedals import PEDAL_TRAVEL, demand_power_w
 from iwm_power_manager.model.top_speed import motor_power_w, top_speed_mps
 
@@ -201,6 +201,10 @@ def supervision_limits(thresholds: Thresholds) -> SupervisionLimits:
     )
 
 
+def _jerked_radps2(axle: Axle) -> float:
+    return (axle.friction_brake.max_torque_nm + axle.motor.peak_torque_nm) / axle.wheel.inertia_kgm2
+
+
 def for_car(thresholds: Thresholds, vehicle: VehicleParams) -> Thresholds:
     """Thresholds that believe a car's own speeds, and what its own pedals ask for at any speed that is believed.
 
@@ -212,11 +216,8 @@ def for_car(thresholds: Thresholds, vehicle: VehicleParams) -> Thresholds:
         _BEYOND_PEDALS * float(interpreted(demand_power_w)(PEDAL_TRAVEL, *travel, speed_max_mps, vehicle))
         for travel in ((1.0, 0.0), (0.0, 1.0))
     )
-    axles = (vehicle.front, vehicle.rear)
-    turning_radps = _BEYOND_ROLLING * speed_max_mps / min(axle.wheel.radius_m for axle in axles)
-    jerked_radps2 = _BEYOND_TORQUE * max(
-        (axle.friction_brake.max_torque_nm + axle.motor.peak_torque_nm) / axle.wheel.inertia_kgm2 for axle in axles
-    )
+    turning_radps = _BEYOND_ROLLING * speed_max_mps / min(vehicle.front.wheel.radius_m, vehicle.rear.wheel.radius_m)
+    jerked_radps2 = _BEYOND_TORQUE * max(_jerked_radps2(vehicle.front), _jerked_radps2(vehicle.rear))
     return dataclasses.replace(
         thresholds,
         speed_max_mps=speed_max_mps,

@@ -143,6 +143,25 @@ def test_without_the_law_the_friction_brakes_do_what_is_asked_for_and_no_motor_d
     assert (sum(command.friction_torque_nm) < 0.0) == (wanted < 0.0 and car.front.friction_brake.max_torque_nm > 0.0)
 
 
+@pytest.mark.parametrize(("front_nm", "rear_nm"), [(300.0, 100.0), (100.0, 300.0)])
+def test_without_the_law_each_axle_brakes_with_what_its_own_brakes_can(front_nm, rear_nm) -> None:
+    car = CARS["drag"]
+    front, rear = (
+        axle._replace(
+            friction_brake=axle.friction_brake._replace(max_torque_nm=nm), wheel=axle.wheel._replace(radius_m=r)
+        )
+        for axle, nm, r in ((car.front, front_nm, 0.3), (car.rear, rear_nm, 0.4))
+    )
+    car = car._replace(front=front, rear=rear)
+    m = Measurement(12.0, (40.0,) * 4, -60e3, 0.01, 0.9, 1e4, 1e4, 0.5)
+    command = braked(m, car)
+    assert command.friction_torque_nm == (-front_nm, -front_nm, -rear_nm, -rear_nm)
+    assert (command.front_power_w, command.rear_power_w) == (-80.0 * front_nm, -80.0 * rear_nm)
+    floor = car.driver.power_speed_floor_mps
+    at_rest = braked(m._replace(wheel_speed_radps=(0.0,) * 4, power_demand_w=-400.0 * floor), car)
+    assert at_rest.friction_torque_nm == pytest.approx((-30.0, -30.0, -40.0, -40.0))
+
+
 @pytest.mark.parametrize("error", [ZeroDivisionError("float division by zero"), IndexError("out of bounds")])
 def test_a_step_that_raises_brakes_as_asked_forgets_nothing_and_is_told(monkeypatch, error) -> None:
     def fails(*_: Any) -> Any:

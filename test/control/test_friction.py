@@ -24,9 +24,13 @@ from oracles.step import friction_coefficient
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
 RADIUS, MASS = CAR.front.wheel.radius_m, CAR.chassis.mass_kg
-#: Front and rear wheels are not alike, nor what stands on them.
+_STIFFNESS, *_SHAPE = CAR.rear.tyre.coefficients
+#: Front and rear wheels and tyres are not alike, nor what stands on them.
 UNLIKE = CAR._replace(
-    rear=CAR.rear._replace(wheel=CAR.rear.wheel._replace(radius_m=0.4, inertia_kgm2=2.0)),
+    rear=CAR.rear._replace(
+        wheel=CAR.rear.wheel._replace(radius_m=0.4, inertia_kgm2=2.0),
+        tyre=CAR.rear.tyre._replace(coefficients=(1.5 * _STIFFNESS, *_SHAPE)),
+    ),
     chassis=CAR.chassis._replace(front_axle_to_cg_m=0.8, rear_axle_to_cg_m=1.6),
 )
 SETTINGS = default_settings()
@@ -270,7 +274,7 @@ def test_the_slope_is_that_of_all_points_at_once(frictions, used, speed, car):
             side = [oracle.points(drive.rows, i, drive.settings, car) for i in wheels]
             if min(np.ptp([point[k] for point in wheel]) for wheel in side for k in (0, 1)) < 1e-3:
                 continue  # rounding alone tells such points apart
-            told, belief = oracle.slope(side, drive.settings, car.front.tyre, DT)
+            told, belief = oracle.slope(side, drive.settings, (car.front.tyre, car.rear.tyre), DT)
             prior, rise = drive.settings.friction_prior, drive.settings.friction_rise_per_s * DT
             change = belief * (told - was.friction) * DT / 0.1
             change += (1.0 - belief) * (prior - was.friction) * DT / drive.settings.friction_return_s

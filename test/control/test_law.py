@@ -960,11 +960,15 @@ def test_wheels_braked_near_what_roads_give_are_gated_as_in_the_plain_law(drawn)
 
 @pytest.mark.parametrize("wheel", range(4))
 @pytest.mark.parametrize("friction", [0.2, 0.5])
-def test_a_wheel_that_alone_of_its_axle_slips_by_less_than_the_road_gives_the_others_gets_no_torque(wheel, friction):
+@pytest.mark.parametrize("other_axle_alike", [False, True])
+def test_a_wheel_that_alone_of_its_axle_slips_by_less_than_the_road_gives_the_others_gets_no_torque(
+    wheel, friction, other_axle_alike
+):
     """Both of an axle may be on another road than the other two; and with as much as the others it is on theirs."""
     alone, both, rolling = {wheel}, {wheel, wheel ^ 1}, 0.05
     for slipping, part, gated in ((alone, 0.4, 1 << wheel), (alone, 0.8, 0), (both, 0.4, 0)):
-        slips = [0.155 if i in slipping or i == wheel ^ 2 else rolling for i in range(4)]
+        others = {wheel ^ 2, wheel ^ 3} if other_axle_alike else {wheel ^ 2}
+        slips = [0.155 if i in slipping | others else rolling for i in range(4)]
         torques = [
             friction * (part if i in slipping else 1.0) * CAR.chassis.mass_kg / 4.0 * G * RADIUS for i in range(4)
         ]

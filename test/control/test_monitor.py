@@ -555,6 +555,12 @@ class TestWhatIsRefusedSaysWhy:
         monitor.take_wheels(wheels(NOW, values, names), NOW)
         assert monitor.tallies[WHEELS].why() == words
 
+    @pytest.mark.parametrize("wheel", range(4))
+    def test_only_the_wheel_that_is_not_believed_is_counted(self, monitor, wheel) -> None:
+        for now in (NOW, NOW + 10 * MS):
+            monitor.take_wheels(wheels(now, tuple(math.nan if i == wheel else 20.0 for i in range(4))), now)
+        assert monitor.wheels_refused == {(NAMES[wheel], WheelVerdict.ABSENT): 2}
+
 
 class TestApart:
     @pytest.mark.parametrize(

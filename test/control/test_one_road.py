@@ -7,30 +7,47 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from iwm_power_manager.control.motion_vote import BEST_ROAD
 from iwm_power_manager.control.one_road import LEAST_GRIP, UNEQUAL_PART, least_road_nm
 from iwm_power_manager.control.types import initial_state
+from iwm_power_manager.model import tyre
+from iwm_power_manager.model.tyre import friction_coefficient
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"), "drag").params
-MASS, LENGTH, HEIGHT = CAR.chassis.mass_kg, CAR.chassis.front_axle_to_cg_m * 2.0, CAR.chassis.cg_height_m
-RADIUS = CAR.front.wheel.radius_m
+#: Axles that have neither loads nor wheels nor tyres in common.
+UNLIKE = CAR._replace(
+    chassis=CAR.chassis._replace(front_axle_to_cg_m=0.8, rear_axle_to_cg_m=1.6),
+    rear=CAR.rear._replace(
+        wheel=CAR.rear.wheel._replace(radius_m=0.4),
+        tyre=tyre.make("fiala", {"slip_stiffness": 18.0, "sliding_factor": 0.9}, 0.5),
+    ),
+)
+CARS = pytest.mark.parametrize("car", [CAR, UNLIKE], ids=["the paper's", "axles unlike"])
 WHEELS = range(4)
 
 
-def loads_nm(deceleration_mps2):
+def axles(car):
+    return car.front, car.front, car.rear, car.rear
+
+
+def loads_nm(deceleration_mps2, car):
     """Torque that a road of friction 1 takes from each wheel."""
-    shift = MASS * deceleration_mps2 * HEIGHT / LENGTH
-    front, rear = ((0.5 * MASS * 9.81 + sign * shift) / 2.0 * RADIUS for sign in (1.0, -1.0))
-    return front, front, rear, rear
+    c = car.chassis
+    length = c.front_axle_to_cg_m + c.rear_axle_to_cg_m
+    front_n = c.mass_kg * (9.81 * c.rear_axle_to_cg_m + deceleration_mps2 * c.cg_height_m) / length
+    loads_n = (front_n, front_n, c.mass_kg * 9.81 - front_n, c.mass_kg * 9.81 - front_n)
+    return tuple(0.5 * load * axle.wheel.radius_m for load, axle in zip(loads_n, axles(car), strict=True))
 
 
-def braked(used, slips, gated=(False,) * 4):
+def braked(used, slips, gated=(False,) * 4, car=CAR):
     """Wheels that take such parts of their loads from the road, in the deceleration that these make."""
     deceleration = 0.0
     for _ in range(50):
-        loads = loads_nm(deceleration)
-        deceleration = sum(part * load for part, load in zip(used, loads, strict=True)) / RADIUS / MASS
+        loads = loads_nm(deceleration, car)
+        forces = [part * nm / axle.wheel.radius_m for part, nm, axle in zip(used, loads, axles(car), strict=True)]
+        deceleration = sum(forces) / car.chassis.mass_kg
     wheel = initial_state().wheels[0]
     wheels = tuple(
         wheel._replace(road_nm=-part * load, slip=-slip, gated=away)
@@ -39,22 +56,23 @@ def braked(used, slips, gated=(False,) * 4):
     return wheels, loads
 
 
-def least(used, slips, gated=(False,) * 4):
+def least(used, slips, gated=(False,) * 4, car=CAR):
     """The same, and what the road takes at least from each, as part of its load."""
-    wheels, loads = braked(used, slips, gated)
-    return [nm / load for nm, load in zip(least_road_nm(wheels, CAR), loads, strict=True)]
+    wheels, loads = braked(used, slips, gated, car)
+    return [nm / load for nm, load in zip(least_road_nm(wheels, car), loads, strict=True)]
 
 
 def one(wheel, value, others):
     return tuple(value if i == wheel else others for i in WHEELS)
 
 
+@CARS
 @pytest.mark.parametrize("wheel", WHEELS)
 @pytest.mark.parametrize(("slip", "part"), [(0.15, 1.0), (0.3, 1.0), (0.1, 1.0), (0.05, 0.5), (0.0, 0.0)])
-def test_a_wheel_has_the_grip_of_the_one_of_its_side_as_far_as_it_slips_like_it(wheel, slip, part):
+def test_a_wheel_has_the_grip_of_the_one_of_its_side_as_far_as_it_slips_like_it(wheel, slip, part, car):
     slips = tuple(slip if i == wheel else 0.1 if i == wheel ^ 2 else 0.02 for i in WHEELS)
     used = tuple(0.45 if i == wheel ^ 2 else 0.1 for i in WHEELS)
-    assert least(used, slips)[wheel] == pytest.approx(LEAST_GRIP * part * 0.45)
+    assert least(used, slips, car=car)[wheel] == pytest.approx(LEAST_GRIP * part * 0.45)
 
 
 @pytest.mark.parametrize("wheel", WHEELS)
@@ -86,6 +104,15 @@ def test_a_brake_that_gives_nothing_says_nothing_of_the_road(wheel):
     used = tuple(0.7 if i in (wheel ^ 1, wheel ^ 2) else 0.1 for i in WHEELS)
     slips = tuple(0.001 if i in (wheel ^ 1, wheel ^ 2) else 0.1 for i in WHEELS)
     assert least(used, slips)[wheel] < 0.03
+
+
+@CARS
+@pytest.mark.parametrize("wheel", WHEELS)
+def test_a_torque_counts_as_far_as_the_wheel_s_own_tyre_takes_it_at_its_slip(wheel, car):
+    used, slips = one(wheel ^ 2, 0.5, 0.1), (0.01,) * 4
+    most = BEST_ROAD * friction_coefficient(0.01, 1.0, axles(car)[wheel ^ 2].tyre)
+    assert most < 0.5
+    assert least(used, slips, car=car)[wheel] == pytest.approx(LEAST_GRIP * most)
 
 
 @pytest.mark.parametrize("wheel", WHEELS)

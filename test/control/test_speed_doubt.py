@@ -17,7 +17,7 @@ from iwm_power_manager.control.speed_doubt import (
     used_friction_of,
 )
 from iwm_power_manager.control.types import Compared, initial_state
-from iwm_power_manager.control.wheel_doubt import DISTRUST_S, SPEED_MPS, SPEED_PART, Turning
+from iwm_power_manager.control.wheel_doubt import DISTRUST_S, ICE_FRICTION, SPEED_MPS, SPEED_PART, Turning
 
 NONE = (0.0, 0.0, 0.0, 0.0)
 STILL = Turning(NONE, NONE, NONE, (False, False, False, False), 600.0, 300.0)
@@ -38,6 +38,15 @@ def test_wheels_roll_freely_while_they_are_no_further_apart_than_a_part_of_their
     for part, free in ((0.95, True), (1.05, False)):
         rolling = rolling_of((speed, speed - part * bound, speed, speed), NONE, STILL)
         assert (rolling.freely, rolling.nearly, rolling.believed) == (free, free, 4)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("wheel", range(4))
+def test_wheels_are_pushed_where_each_has_what_the_smoothest_ice_takes_of_its_own_load(wheel, sign):
+    least_nm = [sign * ICE_FRICTION * load for load in (600.0, 600.0, 300.0, 300.0)]
+    for part, pushed in ((1.01, sign), (0.99, 0.0)):
+        torque_nm = tuple((part if i == wheel else 1.05) * nm for i, nm in enumerate(least_nm))
+        assert rolling_of((20.0,) * 4, NONE, STILL._replace(torque_nm=torque_nm)).pushed == pushed
 
 
 def judged(shown, predicted, acceleration=0.0, **before):

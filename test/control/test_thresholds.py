@@ -128,9 +128,14 @@ def test_a_threshold_that_is_wider_than_the_car_s_pedals_and_speeds_stays_as_it_
     assert thresholds.for_car(wide, load_vehicle(resolve("compact_two_motors")).params) == wide
 
 
-def test_what_a_fast_car_and_its_wheels_do_is_believed():
+@pytest.mark.parametrize("small", ["", "front", "rear"])
+def test_what_a_fast_car_and_its_wheels_do_is_believed(small):
     """350 km/h; on the level its motors reach them, and its brakes stop a wheel without grip within 50 ms."""
     car = load_vehicle(resolve("compact_two_motors")).params
+    if small:
+        axle = getattr(car, small)
+        wheel = axle.wheel._replace(radius_m=0.5 * axle.wheel.radius_m, inertia_kgm2=0.2 * axle.wheel.inertia_kgm2)
+        car = car._replace(**{small: axle._replace(wheel=wheel)})
     chassis = car.chassis._replace(drag_coefficient=0.9 * car.chassis.drag_coefficient)
     found = input_limits(thresholds.for_car(Thresholds(), car._replace(chassis=chassis)), 0.33, by_clock=True)
     fast = 350.0 / 3.6

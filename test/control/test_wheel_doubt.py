@@ -24,6 +24,7 @@ from iwm_power_manager.control.wheel_doubt import (
     combined_factor,
     common_jump,
     middle_of,
+    turning_of,
     wheel_doubts,
     wheels_to_use,
 )
@@ -50,6 +51,18 @@ def judged(wheel, off_mps, change_radps=0.0, gated=False, stray_s=0.0, doubt_s=0
     stray, doubt = wheel_doubts(w, turning, speed, 0.0, DT, one(wheel, stray_s, 0.0), one(wheel, doubt_s, 0.0), CAR)
     assert [value for i, value in enumerate(stray + doubt) if i % 4 != wheel] == [0.0] * 6
     return stray[wheel], doubt[wheel]
+
+
+@WHEELS
+@pytest.mark.parametrize("travel", [-1.0, 1.0])
+def test_what_the_road_takes_from_a_wheel_is_its_torque_less_what_turns_it(wheel, travel):
+    car = CAR._replace(rear=CAR.rear._replace(wheel=CAR.rear.wheel._replace(inertia_kgm2=2.0)))
+    totals = one(wheel, 50.0, 20.0)
+    wheels = tuple(initial_state().wheels[0]._replace(total_nm=nm, speed_radps=40.0) for nm in totals)
+    speeds = one(wheel, travel * 40.1, travel * 40.0)
+    road = turning_of(speeds, wheels, travel, False, DT, NONE, car).road_nm
+    inertia = (car.front if wheel < 2 else car.rear).wheel.inertia_kgm2
+    assert road == pytest.approx(one(wheel, travel * (50.0 - inertia * 10.0), travel * 20.0))
 
 
 @WHEELS

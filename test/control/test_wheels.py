@@ -22,6 +22,7 @@ from iwm_power_manager.control.types import (
     Measurement,
     initial_state,
 )
+from iwm_power_manager.control.yaw import REAR_PART, no_yaw
 from iwm_power_manager.model.chassis import aerodynamic_force_n, rolling_force_n
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -341,6 +342,22 @@ def test_an_axle_s_yaw_budget_is_its_own(axle, now_nm, growth_nmps, most_nm, mom
     part = getattr(CAR, axle)
     assert (left_nm - right_nm) * part.track_width_m / 2.0 / part.wheel.radius_m == pytest.approx(moment_nm)
     assert of(other, [wheel.total_nm for wheel in after.wheels]) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("front_s", [2.0, -2.0])
+@pytest.mark.parametrize("rear_s", [2.0, -2.0, 0.0])
+def test_a_gyroscope_adds_to_both_yaw_budgets_on_the_side_that_the_front_wheels_brake_more(front_s, rear_s):
+    none = {f"{axle}_{name}": 0.0 for axle in ("front", "rear") for name in ("yaw_nm", "yaw_growth_nmps")}
+    tuned = LIMITER._replace(**none, yaw_rate_growth_nmps=600.0, yaw_speed_mps=SPEED)
+    more = 0 if front_s > 0.0 else 1
+    wheels = tuple(rolls * (1.0 if i % 2 == more else 0.5) for i, rolls in enumerate(rolling()))
+    seen = no_yaw(400.0)._replace(known_s=0.5, turned_rad=0.01, believed=True)
+    before = remembered(speed_radps=wheels)._replace(front_unequal_s=front_s, rear_unequal_s=rear_s, yaw=seen)
+    _, after = step(measured(-300e3, wheels)._replace(yaw_rate_radps=1e-6), before, tuned)
+    extra_nm = 400.0 + 600.0 * 0.01
+    for first, axle, moment_nm in ((0, CAR.front, extra_nm), (2, CAR.rear, REAR_PART * extra_nm)):
+        apart_nm = abs(after.wheels[first + more].total_nm) - abs(after.wheels[first + 1 - more].total_nm)
+        assert apart_nm * axle.track_width_m / 2.0 / axle.wheel.radius_m == pytest.approx(moment_nm, rel=1e-3)
 
 
 @AXLES

@@ -57,6 +57,18 @@ class Problem:
 
 @settings(max_examples=60)
 @PROBLEMS
+def test_an_expectation_is_summed_in_the_order_of_the_rows_to_the_bit(rng, powers, cell_shape, controls, tracked):
+    problem = Problem(rng, 3 * powers, cell_shape, controls, tracked)
+    for (p, s, c), found in np.ndenumerate(problem.ahead()):
+        matrix = problem.model.demand[c // (cell_shape[1] * cell_shape[2]) if problem.model.demand.shape[0] > 1 else 0]
+        total = 0.0
+        for weight, cost in zip(matrix[p], problem.to_go[:, s, c], strict=True):
+            total += weight * cost
+        assert found == total
+
+
+@settings(max_examples=60)
+@PROBLEMS
 def test_the_bellman_operator_is_the_smallest_of_all_actions_values(rng, powers, cell_shape, controls, tracked):
     problem = Problem(rng, powers, cell_shape, controls, tracked)
     out, policy = np.empty_like(problem.to_go), np.empty_like(problem.policy)

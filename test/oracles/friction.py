@@ -40,11 +40,14 @@ def points(drive, i, settings, car):
     return found
 
 
-def slope(sides, settings, tyre, dt):
-    """Friction and belief of a side whose two wheels have rolled all the time, from their points."""
+def slope(sides, settings, tyres, dt):
+    """Friction and belief of a side whose two wheels have rolled all the time, from their points.
+
+    How large an error is at least goes by the front wheel's tyre.
+    """
     keep = 1.0 - dt / (settings.friction_memory_s + dt)
     torque_road = torque_curve = square = curves = weights = 0.0
-    for wheel in sides:
+    for wheel, tyre in zip(sides, tyres, strict=True):
         z, u, s, v = np.array(wheel).T
         f = np.array([friction_coefficient(x, 1.0, tyre) for x in s])
         w = np.minimum(v / 10.0, 1.0) ** 2 * keep ** np.arange(len(z))[::-1]
@@ -58,5 +61,5 @@ def slope(sides, settings, tyre, dt):
         return 0.0, 0.0
     k = torque_curve / torque_road
     off = max(curves - 2.0 * k * torque_curve + k * k * square, 0.0)
-    error = math.sqrt((off / weights + friction_coefficient(0.0005, 1.0, tyre) ** 2) / square) / k
+    error = math.sqrt((off / weights + friction_coefficient(0.0005, 1.0, tyres[0]) ** 2) / square) / k
     return min(max(1.0 / k, 0.05), 1.2), 1.0 / (1.0 + (error / 0.1) ** 2)
