@@ -23,10 +23,12 @@ from iwm_power_manager.ros.diagnostics import ERROR, OK, WARN, Status
 #: The child gives way to whatever else runs on the machine.
 NICE = 10
 
-#: What it does first makes it an ordinary process that gives way to others, in memory, too, and ends it with the node.
+#: What it does first makes it an ordinary process that gives way to others, in memory, too, as far as the system lets
+#: it, and ends it with the node.
 _CHILD = f"""\
 import contextlib, json, os, sys, threading
-os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+with contextlib.suppress(OSError):
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as first_to_go:
     first_to_go.write("1000")
 os.nice({NICE})

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 from pathlib import Path
@@ -11,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from iwm_power_manager.control.execution import plain_python
-from iwm_power_manager.nodes.compiling import Compiling, law_status
+from iwm_power_manager.nodes.compiling import NICE, Compiling, law_status
 from iwm_power_manager.ros.diagnostics import WARN
 
 
@@ -60,3 +61,22 @@ def test_where_no_thread_can_wait_for_it_it_is_ended(python, monkeypatch) -> Non
 
     monkeypatch.setattr(threading.Thread, "start", start)
     assert ended(Compiling({}, pytest.fail)) == "no process can compile it: can't start new thread"
+
+
+@pytest.mark.parametrize("refused", ["", "sched_setscheduler"])
+def test_it_prepares_as_the_node_does_and_gives_way_as_far_as_the_system_lets_it(
+    monkeypatch, tmp_path, refused
+) -> None:
+    refuse = f"import os\ndef refuse(*_):\n    raise PermissionError\nos.{refused} = refuse\n" if refused else ""
+    (tmp_path / "sitecustomize.py").write_text(refuse)
+    nodes = tmp_path / "iwm_power_manager" / "nodes"
+    nodes.mkdir(parents=True)
+    for package in (nodes.parent, nodes):
+        (package / "__init__.py").touch()
+    prepare = "import os, sys\ndef prepare(values, at_once):\n    sys.exit(f'{values} {at_once} {os.nice(0)}')\n"
+    (nodes / "preparation.py").write_text(prepare)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    nice = min(os.nice(0) + NICE, 19)
+    said = f"the process that compiles ended with exit code 1: {{'rate_hz': 100.0, 'rule': [1.0]}} False {nice}"
+    assert ended(Compiling({"rate_hz": 100.0, "rule": (1.0,)}, pytest.fail)) == said
