@@ -88,7 +88,17 @@ USES: list[Use] = []
 
 
 class NotKeptError(Exception):
-    """A kernel is not on disk, and nothing may be compiled now."""
+    """A kernel is not on disk, and nothing may be compiled now.
+
+    Attributes
+    ----------
+    can_be_kept : another process can compile it for this one: its sources are those that run here
+    """
+
+    def __init__(self, kernel: str, can_be_kept: bool = True) -> None:
+        why = "" if can_be_kept else ": its sources have changed since this process was started"
+        super().__init__(f"{kernel} has not been compiled{why}")
+        self.can_be_kept = can_be_kept
 
 
 _KEPT_ONLY = ContextVar("kept_only", default=False)
@@ -101,7 +111,7 @@ def kept_only() -> Iterator[None]:
     Raises
     ------
     NotKeptError
-        One would have to be compiled, and could be kept then.
+        One would have to be compiled.
     """
     before = _KEPT_ONLY.set(True)
     try:
@@ -394,8 +404,8 @@ class _Cache(NullCache):
                 STORE.say_damaged(file)
         if result is not None:
             USES.append(Use(self._name, file or "", True, time.perf_counter() - self._started_s[sig]))
-        elif file and _KEPT_ONLY.get():
-            raise NotKeptError(f"{self._name} has not been compiled")
+        elif _KEPT_ONLY.get():
+            raise NotKeptError(self._name, can_be_kept=file is not None)
         elif jit.watch is not None:
             reached = kernel_cache.reach(self._kernel.py_func, lambda value: isinstance(value, Kernel)).code
             names = {" ".join(line.split()[:2]) for line in reached.splitlines()}

@@ -261,6 +261,25 @@ def test_where_only_kept_kernels_may_be_used_one_that_is_not_kept_is_an_error_an
     assert run(toy, tmp_path / "cache", before=KEPT_ONLY)[0] == "60.5 True"
 
 
+EDITED = """
+import pathlib, toy.law, toy.state
+from iwm_power_manager.compilation import NotKeptError, USES, kept_only
+path = pathlib.Path(toy.law.__file__)
+path.write_text(path.read_text() + "# edited")
+try:
+    with kept_only():
+        toy.law.step(toy.state.State(a=1.0, b=0.5), 3.0)
+except NotKeptError as error:
+    print(error, error.can_be_kept, len(USES), end="; ")
+"""
+
+
+def test_where_only_kept_kernels_may_be_used_one_that_nobody_can_keep_is_not_compiled_either(toy, tmp_path) -> None:
+    run(toy, tmp_path / "cache")
+    said = "toy.law.step has not been compiled: its sources have changed since this process was started False 0"
+    assert run(toy, tmp_path / "cache", before=EDITED)[0] == f"{said}; 60.5 False"
+
+
 def test_a_store_knows_whether_it_takes_anything(tmp_path) -> None:
     (tmp_path / "file").touch()
     refusing, taking = Place(tmp_path / "file"), Place(tmp_path / "folder")

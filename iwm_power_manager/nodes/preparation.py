@@ -11,7 +11,6 @@ import statistics
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -120,16 +119,16 @@ def prepare(values: Mapping[str, Any], at_once: bool = True) -> Prepared:
     readers, commands, assembly = _interface(mapping, controller, vehicle, values, limits.inputs.demand)
     from iwm_power_manager.compilation import STORE, USES, NotKeptError, kept_only  # only now: it takes a moment
 
-    compiled = False
-    with suppress(NotKeptError):
+    used, can_wait = len(USES), False
+    try:
         load()
-        compiled = True
-    if not compiled:
+    except NotKeptError as error:
         warm(controller)
-        can_wait = at_once and not values["lockstep"] and STORE.takes() and _keeps_up(controller, period_s)
-        if compiled := not can_wait:
+        can_wait = at_once and error.can_be_kept and not values["lockstep"]
+        can_wait = can_wait and STORE.takes() and _keeps_up(controller, period_s)
+        if not can_wait:
             warm(made(COMPILED))
-    if compiled:
+    if not can_wait:
         controller.run_by(COMPILED)
     controller.table_of = policies.table if estimated else None
     return Prepared(
@@ -142,8 +141,8 @@ def prepare(values: Mapping[str, Any], at_once: bool = True) -> Prepared:
         commands,
         assembly.remarks,
         time.monotonic() - started_s,
-        sum(not use.found for use in USES),
-        None if compiled else load,
+        sum(not use.found for use in USES[used:]),
+        load if can_wait else None,
     )
 
 

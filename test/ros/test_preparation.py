@@ -25,8 +25,8 @@ def kept(monkeypatch, tmp_path) -> list[str]:
 
     @contextmanager
     def kept_only() -> Iterator[None]:
-        if not held:
-            raise compilation.NotKeptError("advance has not been compiled")
+        if held != ["advance"]:
+            raise compilation.NotKeptError("advance", can_be_kept=not held)
         yield
 
     monkeypatch.setattr(compilation, "kept_only", kept_only)
@@ -53,16 +53,23 @@ def test_with_an_empty_cache_it_is_plain_python_until_it_is_loaded(compiled_law,
     assert prepared.controller.step(0, 0.01).command.motor_torque_nm == (0.0,) * 4
 
 
-@pytest.mark.parametrize("why", ["lock-step", "the child process", "a slow machine", "no cache"])
+@pytest.mark.parametrize("why", ["lock-step", "the child process", "a slow machine", "no cache", "edited"])
 def test_it_is_compiled_first_where_plain_python_will_not_do(compiled_law, kept, monkeypatch, tmp_path, why) -> None:
     if why == "a slow machine":
         monkeypatch.setattr(preparation, "PYTHONS_PART", 1e-6)
     if why == "no cache":
         (tmp_path / "file").touch()
         monkeypatch.setattr(compilation, "STORE", Store([Place(tmp_path / "file")], lambda _: None))
+    if why == "edited":
+        kept.append("of other sources")
     prepared = prepare(config.DEFAULTS | {"lockstep": why == "lock-step"}, at_once=why != "the child process")
     assert prepared.load is None
     assert prepared.controller.execution is COMPILED
+
+
+def test_only_what_this_time_had_to_be_compiled_is_counted(compiled_law, monkeypatch) -> None:
+    monkeypatch.setattr(compilation, "USES", [compilation.Use("a kernel", "a file", found=False, seconds=9.0)])
+    assert prepare(config.DEFAULTS).compiled == 0
 
 
 def test_a_wrong_signals_file_is_told_before_anything_is_compiled(kept, monkeypatch, tmp_path) -> None:
