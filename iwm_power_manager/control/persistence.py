@@ -7,7 +7,8 @@ second later it is gone. So the noise is measured while driving. In a series of 
 of variance s2 on top of a signal that wanders shows as E[d_t d_(t-1)] = -s2 (and E[d_t^2] = 2 s2 + q, with q what the
 signal itself wanders): noise alone goes back the way it came. Its steady Kalman gain K, from q / s2, is the part of a
 new value that lasts. The strategy then judges a share by the mean over the latest demands, weighted K (1 - K)^age,
-instead of by the present one. It averages costs, not demands: the cost of a jittering demand is not that of its mean.
+instead of by the present one. It averages costs, not demands: the cost of a jittering demand is not that of its mean;
+but for the part of its slip that wheels do not reach while it lasts (`model.decision.slip_followed`).
 
 The noise goes on. The cost-to-go of a policy that knows none would answer the next jump with a change; what really
 happens is that the share is held and meets the same jumps again. So the mean cost of a step counts for as long as the

@@ -8,6 +8,7 @@ holds no physics of its own: gate (Table 2), torque conversion and limits (eq. 1
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from iwm_power_manager.jit import kernel
@@ -21,7 +22,7 @@ from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.model.quasi_steady import USABLE_FRICTION, Axles, axles_of, demand_force_n, split_outcome_w
 from iwm_power_manager.model.torque import blend, conversion_speed_radps
 from iwm_power_manager.model.two_axles import UNSURE, Curve, step_from
-from iwm_power_manager.model.tyre import peak_ratio, slip_ratio
+from iwm_power_manager.model.tyre import peak_ratio, slip_at_friction, slip_ratio
 
 #: Where the delivered power is measured: torque times speed at the wheel (sees no power lost in slip), or at the
 
@@ -156,8 +157,8 @@ def step_cost_and_next(
     `shortfall_w`. Braking is never short: what regeneration cannot take, friction does.
     """
     if problem.slip_model == SLIP_QUASI_STEADY:
-        before = settled(power_demand_w, speed_mps, vehicle, problem)
-        return settled_step(before, power_demand_w, speed_mps, front_share, False, vehicle, problem)
+        before = settled(power_demand_w, speed_mps, True, vehicle, problem)
+        return settled_step(before, power_demand_w, speed_mps, front_share, True, False, vehicle, problem)
     start = given(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
     moved = step_from(start.before, start.torques, start.before, problem.friction, UNSURE, problem.dt_s, vehicle)
     return outcome_of(power_demand_w, start, moved, vehicle, problem)
@@ -180,8 +181,8 @@ def step_near(
     `guess` and `curves` : see `two_axles.step_from`; not used where slip is settled.
     """
     if problem.slip_model == SLIP_QUASI_STEADY:
-        before = settled(power_demand_w, speed_mps, vehicle, problem)
-        return settled_step(before, power_demand_w, speed_mps, front_share, False, vehicle, problem), guess
+        before = settled(power_demand_w, speed_mps, True, vehicle, problem)
+        return settled_step(before, power_demand_w, speed_mps, front_share, True, False, vehicle, problem), guess
     start = given(power_demand_w, speed_mps, slip_front, slip_rear, front_share, vehicle, problem)
     moved = step_from(start.before, start.torques, guess, problem.friction, curves, problem.dt_s, vehicle)
     return outcome_of(power_demand_w, start, moved, vehicle, problem), moved.speeds
@@ -321,9 +322,11 @@ class Settled(NamedTuple):
 
 
 @kernel
-def settled(power_demand_w: float, speed_mps: float, vehicle: VehicleParams, problem: ProblemParams) -> Settled:
-    """A step of a demand at a speed, before it is split."""
-    force = demand_force_n(power_demand_w, speed_mps, problem.friction, True, vehicle)
+def settled(
+    power_demand_w: float, speed_mps: float, slip_aware: bool, vehicle: VehicleParams, problem: ProblemParams
+) -> Settled:
+    """A step of a demand at a speed, before it is split; not `slip_aware`, as if no wheel slipped."""
+    force = demand_force_n(power_demand_w, speed_mps, problem.friction, slip_aware, vehicle)
     # A driver makes up for what a split did not deliver: the speed follows what was asked for, as far as the road can
     # carry it. Would it follow what was delivered, then braking less than was asked for would leave a higher speed, at
     # which the same power is less force, and less of it were missing: a policy would be rewarded for not braking.
@@ -334,7 +337,7 @@ def settled(power_demand_w: float, speed_mps: float, vehicle: VehicleParams, pro
     resistance = road_load_n(speed_mps, 0.0, vehicle.chassis)
     acceleration = (min(max(force, -grip), grip) - resistance) / equivalent_mass_kg(vehicle)
     after = max(speed_mps + problem.dt_s * acceleration, 0.0)
-    return Settled(force, axles_of(force, speed_mps, problem.friction, True, vehicle), after)
+    return Settled(force, axles_of(force, speed_mps, problem.friction, slip_aware, vehicle), after)
 
 
 @kernel
@@ -343,6 +346,7 @@ def settled_step(
     power_demand_w: float,
     speed_mps: float,
     front_share: float,
+    slip_aware: bool,
     least: bool,
     vehicle: VehicleParams,
     problem: ProblemParams,
@@ -353,7 +357,7 @@ def settled_step(
     """
     battery, force = vehicle.battery, before.force_n
     power, missing, over = split_outcome_w(
-        before.axles, force, speed_mps, front_share, problem.friction, True, least, vehicle
+        before.axles, force, speed_mps, front_share, problem.friction, slip_aware, least, vehicle
     )
     shortfall = 0.0
     if power_demand_w > 0.0:
@@ -367,3 +371,22 @@ def settled_step(
     error = error_cost_j(force * rolling, given * rolling, problem)
     cost = power * problem.dt_s + error + over * rolling * HANDOVER_S
     return Step(cost, before.speed_mps, 0.0, 0.0, shortfall)
+
+
+@kernel
+def slip_followed(
+    force_n: float, speed_mps: float, held_s: float, vehicle: VehicleParams, problem: ProblemParams
+) -> float:
+    """Part of the slip of a road force, 0..1, that wheels reach on average while it is held.
+
+    They have to be turned faster, or slower, by the force itself: at a constant one, which lags their slip behind it by
+    m v s / F, with m what their inertia stands for and s the slip. That is hundredths of a second on a slippery road.
+    """
+    mass = vehicle.chassis.mass_kg
+    most = USABLE_FRICTION * problem.friction * peak_ratio(vehicle.front.tyre)
+    used = min(max(force_n / (mass * GRAVITY_MPS2), -most), most)
+    slip = slip_at_friction(used, problem.friction, vehicle.front.tyre)
+    lag_s = (equivalent_mass_kg(vehicle) - mass) * speed_mps * slip / force_n if force_n != 0.0 else 0.0
+    if lag_s <= 0.0:
+        return 1.0
+    return 1.0 - lag_s / held_s * (1.0 - math.exp(-held_s / lag_s))

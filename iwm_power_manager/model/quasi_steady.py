@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Electrical power for a given road force and front share, with the slips settled.
 
-Slip settles within milliseconds, a decision about the split holds for 100 ms and more: for choosing the split, each
-tyre sits where the inverse Magic Formula puts it. The demand is met at the road (F_x * v), so that power spun away in
-slip costs what it costs and buys nothing. What an axle cannot give (tyre, motor) goes to the other one, as the control
-law does it; what neither can give is returned, not hidden.
+Slip settles within milliseconds, on ice at speed within some 100 (`decision.slip_followed`); a decision about the split
+holds for 100 ms and more: for choosing the split, each tyre sits where the inverse Magic Formula puts it. The demand is
+met at the road (F_x * v), so that power spun away in slip costs what it costs and buys nothing. What an axle cannot
+give (tyre, motor) goes to the other one, as the control law does it; what neither can give is returned, not hidden.
 """
 
 from __future__ import annotations

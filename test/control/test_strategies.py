@@ -239,24 +239,41 @@ def test_of_now_and_a_step_of_the_chain_ago_the_mean_counts_and_what_both_ask_fo
         assert within_rounding(costs, ours, 1e-6)
 
 
-def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_noise_lasts():
-    gain, latest, demand = 0.5, (4000.0, 9000.0, 1000.0), 6000.0
-    jitter = no_jitter()._replace(samples_w=latest + (0.0,) * 7, taken=3, gain=gain)
-    at = situation(demand, previous=0.3)._replace(jitter=jitter)
-    ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, TABLE)
+@settings(max_examples=60)
+@given(
+    st.lists(POWER, min_size=4, max_size=4),
+    st.floats(2.0, 35.0),
+    SHARE,
+    st.sampled_from([0.2, 0.5, 0.9]),
+    st.sampled_from([0.0, 0.6]),
+)
+def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_noise_lasts(
+    demands, speed, previous, friction, discount
+):
+    gain = 0.5
+    demand, *latest = demands
+    jitter = no_jitter()._replace(samples_w=(*latest, *(0.0,) * 7), taken=3, gain=gain)
+    at = situation(demand, speed, previous=previous)._replace(jitter=jitter)
+    table = TABLE._replace(problem=TABLE.problem._replace(friction=friction), discount=discount)
+    ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, table)
     # Two samples more at this gain: 0.2 s, for which the step's cost goes on.
-    steps = 1.0 + 0.2 / TABLE.problem.dt_s
+    steps = 1.0 + 0.2 / table.problem.dt_s
     weights = gain * (1.0 - gain) ** np.arange(4)
-    total = dict.fromkeys((0.3, *TABLE.share), 0.0)
-    for power, weight in zip((demand, *latest), weights / weights.sum(), strict=True):
+
+    def settled_j(power, share):
+        return step_cost_and_next(power, speed, 0.0, 0.0, share, CAR, table.problem).cost_j
+
+    step_j = splits.lagging(demands, weights, speed, settled_j, table.problem, CAR)
+    total = dict.fromkeys((previous, *table.share), 0.0)
+    for power, weight in zip(demands, weights / weights.sum(), strict=True):
 
         def outcome(share, power=power):
-            step = step_cost_and_next(power, 12.0, 0.0, 0.0, share, CAR, TABLE.problem)
-            return step.cost_j, step.speed_mps, step.slip_front, step.slip_rear
+            step = step_cost_and_next(power, speed, 0.0, 0.0, share, CAR, table.problem)
+            return step_j(power, share), step.speed_mps, step.slip_front, step.slip_rear
 
-        for share, cost in splits.bellman((power, 12.0, 0.0, 0.0), 0.3, TABLE, outcome, steps=steps).items():
+        for share, cost in splits.bellman((power, speed, 0.0, 0.0), previous, table, outcome, steps=steps).items():
             total[share] += weight * cost
-    assert within_rounding(total, ours, 1e-6)
+    assert within_rounding(total, ours, 1e-4)
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(2, 1.0), (2, -1.0), (3, 1.0), (3, -1.0)])
@@ -351,20 +368,42 @@ def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_
     assert free / minute[1] == pytest.approx(np.exp(1.2), rel=0.05)
 
 
+def test_no_load_is_moved_off_an_axle_for_slip_that_a_jitter_does_not_reach():
+    shares = np.linspace(0.0, 1.0, 21)
+    free = empty_table(shares)._replace(discount=0.0, problem=TABLE.problem._replace(friction=0.2))
+    gain, speed, demands = 0.2, 25.0, (28e3, *(8e3, 28e3) * 5)
+    weights = gain * (1.0 - gain) ** np.arange(11)
+    at = situation(demands[0], speed, previous=0.5)._replace(
+        jitter=no_jitter()._replace(samples_w=demands[1:], taken=20, gain=gain)
+    )
+    ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, free)
+
+    def settled_j(power, share):
+        return step_cost_and_next(power, speed, 0.0, 0.0, share, CAR, free.problem).cost_j
+
+    def cheapest(step_j):
+        return min(shares, key=lambda share: sum(w * step_j(p, share) for w, p in zip(weights, demands, strict=True)))
+
+    assert ours == cheapest(splits.lagging(demands, weights, speed, settled_j, free.problem, CAR)) == 0.5
+    assert cheapest(settled_j) < 0.5
+
+
 def test_a_demand_that_jitters_is_judged_by_the_mean_of_what_it_jitters_between():
     high, low, previous = 9000.0, 800.0, 0.5
     free = TABLE._replace(discount=0.0, switching_cost_j=1.0, switching_fixed_cost_j=0.0)
     gain = 0.4
     jitter = no_jitter()._replace(samples_w=(low, high) * 5, taken=20, gain=gain)
 
-    def outcome(power):
-        return {share: step_cost_and_next(power, 12.0, 0.0, 0.0, share, CAR, free.problem).cost_j for share in SHARES}
+    def settled_j(power, share):
+        return step_cost_and_next(power, 12.0, 0.0, 0.0, share, CAR, free.problem).cost_j
 
     weights = [gain * (1.0 - gain) ** age for age in range(11)]
+    demands = (high, *(low, high) * 5)
+    step_j = splits.lagging(demands, weights, 12.0, settled_j, free.problem, CAR)
     costs = dict.fromkeys(SHARES, 0.0)
-    for weight, power in zip(weights, (high, *(low, high) * 5), strict=True):
-        for share, cost in outcome(power).items():
-            costs[share] += weight / sum(weights) * cost
+    for weight, power in zip(weights, demands, strict=True):
+        for share in SHARES:
+            costs[share] += weight / sum(weights) * step_j(power, share)
     for share in SHARES:
         costs[share] += abs(share - previous)
     at = situation(high, previous=previous)._replace(jitter=jitter)

@@ -17,11 +17,12 @@ from iwm_power_manager.model.decision import (
     ERROR_NORMS,
     axles_gated,
     error_cost_j,
+    slip_followed,
     step_cost_and_next,
     wheel_speed_of_state,
 )
 from iwm_power_manager.model.quasi_steady import demand_force_n, split_power_w
-from iwm_power_manager.model.tyre import slip_ratio
+from iwm_power_manager.model.tyre import friction_coefficient, slip_at_friction, slip_ratio
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
 from oracles import step as oracle
@@ -265,3 +266,26 @@ def test_where_no_control_is_feasible_those_that_deliver_most_are_left():
     )
     model = build_model(problem, CAR.params, 0.9, np.eye(1)[None])
     assert np.array_equal(np.isfinite(model.free_cost), [False, True, False])
+
+
+@pytest.mark.parametrize("speed", [3.0, 10.0, 30.0])
+@pytest.mark.parametrize(("part", "near"), [(0.05, 0.01), (0.6, 0.05), (0.9, 0.15)])
+def test_slip_is_followed_as_far_as_a_force_turns_wheels_while_it_is_held(speed, part, near):
+    car, friction, held_s, dt = CAR.params, 0.2, 0.1, 1e-5
+    wheel, load_n = car.front.wheel, car.chassis.mass_kg * 9.81 / 4.0
+    force_n = part * friction * load_n
+    slip = mean = 0.0
+    for _ in range(round(held_s / dt)):
+        surplus_nm = (force_n - friction_coefficient(slip, friction, car.front.tyre) * load_n) * wheel.radius_m
+        slip += surplus_nm / wheel.inertia_kgm2 * dt * wheel.radius_m / speed
+        mean += slip * dt / held_s
+    reached = mean / slip_at_friction(part * friction, friction, car.front.tyre)
+    ours = slip_followed(4.0 * force_n, speed, held_s, car, _params(friction=friction))
+    assert ours == pytest.approx(reached, abs=near)
+    assert slip_followed(-4.0 * force_n, speed, held_s, car, _params(friction=friction)) == ours
+
+
+def test_a_wheel_at_rest_or_without_force_has_no_slip_to_follow():
+    params = _params(friction=0.2)
+    assert slip_followed(0.0, 20.0, 0.1, CAR.params, params) == 1.0
+    assert slip_followed(900.0, 0.0, 0.1, CAR.params, params) == 1.0

@@ -50,13 +50,49 @@ def split_w(force, speed, share, friction, slip_aware, vehicle):
     return battery_w(power, vehicle.battery), sum(asked) - sum(given)
 
 
+def mean_slip(force, friction, vehicle):
+    """Magnitude of the slip that carries a road force, both axles alike."""
+    used = min(abs(force) / (vehicle.chassis.mass_kg * G), 0.99 * friction * vehicle.front.tyre.coefficients[2])
+    return slip_for(used, friction, vehicle.front.tyre)
+
+
+def lagging(demands, weights, speed, settled_j, problem, vehicle):
+    """Cost (demand, share), J, of a step while the demand jitters, from that with settled slip, `settled_j`.
+
+    Each of the demands is held for 0.1 s. Wheels are turned faster by the force itself: what their slip lacks of the
+    settled one on average over that time is left at that of the mean demand.
+    """
+    axles = (vehicle.front, vehicle.rear)
+    inertia = sum(2.0 * axle.wheel.inertia_kgm2 / axle.wheel.radius_m**2 for axle in axles)
+    mean = float(np.average(demands, weights=weights))
+
+    def reached(demand):
+        rolling = max(speed, vehicle.driver.power_speed_floor_mps)
+        slip = mean_slip(demand / rolling, problem.friction, vehicle)
+        rim = speed / (1.0 - slip) if demand > 0.0 else speed * (1.0 - slip)
+        force = abs(demand) / max(rim, vehicle.driver.power_speed_floor_mps)
+        lag = inertia * speed * mean_slip(force, problem.friction, vehicle) / force
+        times = np.linspace(0.0, 0.1, 20001)
+        return float(np.trapezoid(1.0 - np.exp(-times / lag), times)) / 0.1
+
+    def slip_j(demand, share):
+        power, _ = split_w(demand / speed, speed, share, problem.friction, False, vehicle)
+        return settled_j(demand, share) - power * problem.dt_s
+
+    def cost(demand, share):
+        part = reached(demand)
+        own = slip_j(demand, share)
+        return settled_j(demand, share) - own + part * own + (1.0 - part) * slip_j(mean, share)
+
+    return cost
+
+
 def cheapest(demand, speed, previous, friction, slip_aware, switching, vehicle, shares):
     """Least battery power, what is missing priced, a change of share worth it only beyond `switching`."""
     rolling = max(speed, vehicle.driver.power_speed_floor_mps)
     force = demand / rolling
     if slip_aware:
-        used = min(abs(force) / (vehicle.chassis.mass_kg * G), 0.99 * friction * vehicle.front.tyre.coefficients[2])
-        slip = slip_for(used, friction, vehicle.front.tyre)
+        slip = mean_slip(force, friction, vehicle)
         rim = speed / (1.0 - slip) if demand > 0.0 else speed * (1.0 - slip)
         force = demand / max(rim, vehicle.driver.power_speed_floor_mps)
 

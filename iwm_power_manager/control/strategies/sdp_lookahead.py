@@ -11,13 +11,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from iwm_power_manager.control.budget import affordable, price_factor, price_level, price_units
-from iwm_power_manager.control.persistence import SAMPLES, demand_ago, held_s, remembered_s
+from iwm_power_manager.control.persistence import SAMPLE_S, SAMPLES, demand_ago, held_s, remembered_s
 from iwm_power_manager.control.strategies.instantaneous import LEAST_DIFFERENCE_W
 from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.grid import Ends, ends, interpolate3_of_5
 from iwm_power_manager.jit import kernel
-from iwm_power_manager.model.decision import SLIP_QUASI_STEADY, Settled, settled, settled_step, step_cost_and_next
+from iwm_power_manager.model.decision import (
+    SLIP_QUASI_STEADY,
+    Settled,
+    settled,
+    settled_step,
+    slip_followed,
+    step_cost_and_next,
+)
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.pedals import full_power_w
 
@@ -57,7 +64,7 @@ class _Ahead(NamedTuple):
 def _ahead(
     power_demand_w: float, earlier_w: float, situation: Situation, vehicle: VehicleParams, policy: PolicyTable
 ) -> _Ahead:
-    before = settled(power_demand_w, situation.speed_mps, vehicle, policy.problem)
+    before = settled(power_demand_w, situation.speed_mps, True, vehicle, policy.problem)
     return _Ahead(
         before,
         ends(policy.power_w, power_demand_w),
@@ -163,20 +170,35 @@ def _outlook(
     vehicle: VehicleParams,
     policy: PolicyTable,
 ) -> _Outlook:
-    """What this share costs, in the mean over what the demand jitters between."""
-    gain = situation.jitter.gain
+    """What this share costs, in the mean over what the demand jitters between.
+
+    What a tyre's slip does not follow of the jitter costs what the slip of the mean demand costs.
+    """
+    speed, problem, gain = situation.speed_mps, policy.problem, situation.jitter.gain
     demand_w = situation.power_demand_w
     samples = min(SAMPLES, situation.jitter.taken) if gain <= _LASTING else 0
-    step = later = earlier = weights = 0.0
+    lags = problem.slip_model == SLIP_QUASI_STEADY
+    step = later = earlier = weights = mean_w = unfollowed = 0.0
     weight = gain
-    for i in range(-1, samples):
+    for i in range(-1, samples + 1 if lags else samples):
         if i >= 0:
-            demand_w = situation.jitter.samples_w[i]
+            demand_w = situation.jitter.samples_w[i] if i < samples else mean_w / weights
             ahead = _ahead(demand_w, demand_w, situation, vehicle, policy)
         one = _demand_outlook(ahead, demand_w, situation, share, cell, least, bound, found, level, vehicle, policy)
         if gain > _LASTING:
             return one
-        step += weight * one.step_j
+        followed, slipless_j = 1.0, one.step_j
+        if lags:
+            followed = slip_followed(ahead.settled.force_n, speed, SAMPLE_S, vehicle, problem)
+            rolling = settled(demand_w, speed, False, vehicle, problem)
+            slipless_j = settled_step(rolling, demand_w, speed, share, False, False, vehicle, problem).cost_j
+        slip_j = one.step_j - slipless_j
+        if i == samples:
+            step += unfollowed * slip_j
+            break
+        step += weight * (slipless_j + followed * slip_j)
+        unfollowed += weight * (1.0 - followed)
+        mean_w += weight * demand_w
         later += weight * one.later_j
         earlier += weight * one.earlier_j
         weights += weight
@@ -208,7 +230,7 @@ def _demand_outlook(
     speed, problem = situation.speed_mps, policy.problem
     end, front, rear = ahead.speed, ahead.slip_front, ahead.slip_rear
     if problem.slip_model == SLIP_QUASI_STEADY:
-        outcome = settled_step(ahead.settled, power_demand_w, speed, share, least, vehicle, problem)
+        outcome = settled_step(ahead.settled, power_demand_w, speed, share, True, least, vehicle, problem)
         if bound:
             return _Outlook(outcome.cost_j, found.later_j, found.earlier_j)
     else:
