@@ -86,6 +86,13 @@ def compiled_law() -> None:
     advance(measurement, before, after, default_settings("equal"), vehicle, empty_table())
 
 
+@pytest.fixture
+def empty_cache(tmp_path: Path) -> dict[str, str]:
+    """Environment in which a node finds no kernel, in none of the folders where it looks."""
+    (tmp_path / "tmp").mkdir()
+    return {"IWM_CACHE_DIR": str(tmp_path / "cache"), "NUMBA_CACHE_DIR": "", "TMPDIR": str(tmp_path / "tmp")}
+
+
 def _pairs(folders: pytest.TempPathFactory) -> Iterator[Callable[..., Pair]]:
     pairs: list[Pair] = []
 

@@ -21,12 +21,11 @@ EQUAL, CHOSEN = (STRATEGIES[name].code for name in ("equal", "sdp_lookahead"))
 
 
 @pytest.fixture
-def cold(start_own: Callable[..., Any], tmp_path: Path) -> Any:
+def cold(start_own: Callable[..., Any], empty_cache: dict[str, str]) -> Any:
     """A power manager whose kernel cache is empty, with its bench; on a busy machine, too, it drives at once and on."""
     parameters = {"strategy": "sdp_lookahead", "policy_file": "policies", "rate_hz": 10.0, "missed_periods": 100}
     patient = {"own_gap_s": 60.0, "clock_stopped_s": 60.0, "command_oldest_s": 1.0}
-    folders = {"IWM_CACHE_DIR": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}
-    return start_own(parameters | patient, environment=folders)
+    return start_own(parameters | patient, environment=empty_cache)
 
 
 def child_of(pair: Any) -> psutil.Process:
@@ -101,10 +100,10 @@ def test_for_how_long_it_has_been_compiling_is_said(cold) -> None:
     assert [value.key for value in said] == ["compiling for, s"]
 
 
-def test_where_no_process_can_be_started_it_drives_all_the_same(start_own, tmp_path) -> None:
+def test_where_no_process_can_be_started_it_drives_all_the_same(start_own, tmp_path, empty_cache) -> None:
     (tmp_path / "sitecustomize.py").write_text("import sys; sys.executable = ''")  # as in a program that embeds Python
-    folders = {"IWM_CACHE_DIR": str(tmp_path / "cache"), "TMPDIR": str(tmp_path), "PYTHONPATH": f"{tmp_path}:{ROOT}"}
-    pair = start_own({"rate_hz": 10.0, "missed_periods": 100, "own_gap_s": 60.0}, environment=folders)
+    environment = empty_cache | {"PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    pair = start_own({"rate_hz": 10.0, "missed_periods": 100, "own_gap_s": 60.0}, environment=environment)
     bench = pair.bench
     bench.drive(lambda: drives(bench) and "no process can compile it: [Errno" in law(bench)[1], "torque and the reason")
     assert law(bench)[0] == DiagnosticStatus.WARN

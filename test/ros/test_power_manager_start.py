@@ -133,10 +133,9 @@ def test_it_runs_from_its_parameter_file_in_a_namespace_with_remaps(tmp_path, co
         bench.close()
 
 
-def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, monkeypatch) -> None:
-    cache = tmp_path / "cache"
-    monkeypatch.setenv("IWM_CACHE_DIR", str(cache))
-    running = Running(MODULE, arguments({"strategy": "equal"}), DOMAIN, tmp_path)
+def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, empty_cache) -> None:
+    cache = Path(empty_cache["IWM_CACHE_DIR"])
+    running = Running(MODULE, arguments({"strategy": "equal"}), DOMAIN, tmp_path, empty_cache)
     end = time.monotonic() + PATIENCE_S
     while not any(cache.rglob("iwm_power_manager.*")):  # what the law's step needs beside it
         assert running.process.poll() is None, running.text()
@@ -147,11 +146,10 @@ def test_ctrl_c_while_it_compiles_ends_it_at_once(tmp_path, monkeypatch) -> None
     assert not any(cache.rglob("*.repeat.advance-*")), "it went on compiling"
 
 
-def test_services_are_answered_while_it_compiles(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv("IWM_CACHE_DIR", str(tmp_path / "cache"))
+def test_services_are_answered_while_it_compiles(tmp_path, empty_cache) -> None:
     bench = Bench(namespace="/compiling")
     given = {"strategy": "equal", "lockstep": True}  # where it waits for the compiled law
-    running = Running(MODULE, arguments(given, {"__ns": "/compiling"}), DOMAIN, tmp_path)
+    running = Running(MODULE, arguments(given, {"__ns": "/compiling"}), DOMAIN, tmp_path, empty_cache)
     try:
         assert bench.lifecycle_state() == "unconfigured"
         assert bench.get_parameter("rate_hz") == 100.0
