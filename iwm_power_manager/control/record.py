@@ -168,7 +168,7 @@ _LARGEST_COUNT = 2.0**53
 def decided(command: Command, before: ControllerState, after: ControllerState) -> tuple[float, ...]:
     """Values of `DECIDED_NAMES`."""
     motor, friction, brakes = command.motor_torque_nm, command.friction_torque_nm, command.brake_gain
-    front_left, front_right, rear_left, rear_right = after.wheels
+    wheels = after.wheels
     return (
         motor[0],
         motor[1],
@@ -199,8 +199,8 @@ def decided(command: Command, before: ControllerState, after: ControllerState) -
         command.left_confidence,
         command.right_confidence,
         float(before.steps),
-        max(front_left.heat, front_right.heat),
-        max(rear_left.heat, rear_right.heat),
+        max(wheels[0].heat, wheels[1].heat),
+        max(wheels[2].heat, wheels[3].heat),
     )
 
 

@@ -11,10 +11,13 @@ from hypothesis import strategies as st
 from iwm_power_manager.mdp.sweep import GATED, TIE_J, apply_policy, expect_over_demand, flow, improve
 from oracles.dense_mdp import dense, pack, random_raw
 
+_ONE = st.just(1)
 PROBLEMS = given(
     rng=st.integers(0, 10_000).map(np.random.default_rng),
     powers=st.integers(1, 6),
-    cell_shape=st.tuples(st.integers(1, 3), st.integers(1, 3), st.integers(1, 3)),
+    # Without slip a cell is a speed alone.
+    cell_shape=st.tuples(st.integers(1, 3), st.integers(1, 3), st.integers(1, 3))
+    | st.tuples(st.integers(2, 4), _ONE, _ONE),
     controls=st.integers(2, 4),
     tracked=st.booleans(),
 )
