@@ -287,6 +287,7 @@ def measure(
         (0.0, 0.0, 0.0, 0.0),
         math.nan,
         math.nan,
+        math.nan,
     )
 
 

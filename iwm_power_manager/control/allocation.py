@@ -74,7 +74,8 @@ def drive(
     front_s, rear_s = state.front_unequal_s, state.rear_unequal_s
     lasting_s = front_s if abs(front_s) > UNEQUAL_S else 0.0
     growth = speed_part(speed, s) * s.yaw_rate_growth_nmps
-    yaw = yaw_step(state.yaw, measurement.yaw_rate_radps, lasting_s, growth, braking, dt)
+    rate, lateral = measurement.yaw_rate_radps, measurement.lateral_mps2
+    yaw = yaw_step(state.yaw, rate, lateral, speed, lasting_s, growth, braking, dt)
     targets = slip_targets(front_s, braking, yaw.believed, s)
     front_alike = alike_wheels(0, measurement, before, targets)
     rear_alike = alike_wheels(2, measurement, before, targets)

@@ -238,6 +238,7 @@ class Controller:
             motor_stuck_nm=self.actuators.stuck_nm,
             acceleration_mps2=monitor.acceleration_mps2(now_ns),
             yaw_rate_radps=monitor.yaw_rate_radps(now_ns),
+            lateral_mps2=monitor.lateral_mps2(now_ns),
         )
 
     def _settings(self) -> Settings:

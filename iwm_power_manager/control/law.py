@@ -63,6 +63,7 @@ def _believed(measurement: Measurement, motion: Motion, travel: float, settings:
         (travel * stuck[0], travel * stuck[1], travel * stuck[2], travel * stuck[3]),
         m.acceleration_mps2,
         travel * m.yaw_rate_radps,
+        m.lateral_mps2,
     )
 
 

@@ -249,6 +249,7 @@ class InputMonitor:
         self.motor_torque_nm: Wheels | None = None
         self._acceleration = (math.nan, 0)
         self._yaw_rate = (math.nan, 0)
+        self._lateral = (math.nan, 0)
         self._wheel_memory = NEW_WHEELS
         self.forget_times()
 
@@ -368,6 +369,8 @@ class InputMonitor:
             self.take_acceleration(value, now_ns)
         elif signal == "yaw_rate":
             self.take_yaw_rate(value, now_ns)
+        elif signal == "lateral_acceleration":
+            self.take_lateral(value, now_ns)
 
     def take_acceleration(self, acceleration_mps2: float, now_ns: int) -> None:
         """Keep what an accelerometer shows, forward."""
@@ -386,6 +389,15 @@ class InputMonitor:
     def yaw_rate_radps(self, now_ns: int) -> float:
         """Yaw rate as a gyroscope shows it; NaN where there is none, or it has been silent for long."""
         return _heard(self._yaw_rate, now_ns)
+
+    def take_lateral(self, lateral_mps2: float, now_ns: int) -> None:
+        """Keep what an accelerometer shows to the side, positive to the left."""
+        if abs(lateral_mps2) <= _MOST_MPS2:
+            self._lateral = (lateral_mps2, now_ns)
+
+    def lateral_mps2(self, now_ns: int) -> float:
+        """Lateral acceleration as an accelerometer shows it; NaN where there is none, or it has long been silent."""
+        return _heard(self._lateral, now_ns)
 
     def take_demand(self, demand_w: float, delay_s: float, now_ns: int, lag_s: float = 0.0) -> bool:
         """Judge `power_demand`, received `delay_s` after it was sent; True if it was accepted.

@@ -46,6 +46,8 @@ _MEASUREMENT = (
     Signal("accelerometer", "1 where there is one, 0 where not"),
     Signal("yaw_rate_radps", "of a gyroscope, positive to the left"),
     Signal("gyroscope", "1 where there is one, 0 where not"),
+    Signal("lateral_mps2", "of an accelerometer, positive to the left"),
+    Signal("lateral_accelerometer", "1 where there is one, 0 where not"),
 )
 _COMMAND = (
     *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in WHEEL_NAMES),
@@ -135,6 +137,8 @@ def to_numbers(
         0.0 if math.isnan(measurement.acceleration_mps2) else 1.0,
         0.0 if math.isnan(measurement.yaw_rate_radps) else measurement.yaw_rate_radps,
         0.0 if math.isnan(measurement.yaw_rate_radps) else 1.0,
+        0.0 if math.isnan(measurement.lateral_mps2) else measurement.lateral_mps2,
+        0.0 if math.isnan(measurement.lateral_mps2) else 1.0,
         *decided,
         *supervision[:4],
         watch.wheels_lost,
@@ -148,6 +152,7 @@ def to_numbers(
 YOUNGER_SIGNALS = (
     {"gated_wheels": 0.0, "doubted": 0.0, "hold_nm": 0.0, "direction": 1.0}
     | {"acceleration_mps2": 0.0, "accelerometer": 0.0, "yaw_rate_radps": 0.0, "gyroscope": 0.0}
+    | {"lateral_mps2": 0.0, "lateral_accelerometer": 0.0}
     | {f"{wheel}_brake_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_stuck_nm": 0.0 for wheel in WHEEL_NAMES}
@@ -228,6 +233,7 @@ def measurement_of(numbers: Sequence[float]) -> Measurement:
         motor_stuck_nm=(n[16], n[17], n[18], n[19]),
         acceleration_mps2=n[20] if n[21] else math.nan,
         yaw_rate_radps=n[22] if n[23] else math.nan,
+        lateral_mps2=n[24] if n[25] else math.nan,
     )
 
 

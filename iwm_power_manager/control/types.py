@@ -64,6 +64,7 @@ class Measurement(NamedTuple):
     motor_stuck_nm : torque that a motor has whatever it is commanded; friction makes up for it while braking
     acceleration_mps2 : forward, of an accelerometer on the body, the slope's part included (NaN: there is none)
     yaw_rate_radps : of a gyroscope on the body, positive to the left (NaN: there is none)
+    lateral_mps2 : of an accelerometer on the body, positive to the left (NaN: there is none)
     """
 
     speed_mps: float
@@ -79,6 +80,7 @@ class Measurement(NamedTuple):
     motor_stuck_nm: Wheels = (0.0, 0.0, 0.0, 0.0)
     acceleration_mps2: float = math.nan
     yaw_rate_radps: float = math.nan
+    lateral_mps2: float = math.nan
 
 
 class Command(NamedTuple):

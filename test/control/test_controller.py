@@ -372,11 +372,14 @@ class TestRecord:
         drive.controller.monitor.take_acceleration(-3.5, drive.now_ns)
         drive.controller.monitor.take_yaw_rate(0.2, drive.now_ns)
         drive.controller.monitor.take_yaw_rate(-10.1, drive.now_ns)  # no car's
+        drive.controller.monitor.take_lateral(-1.5, drive.now_ns)
+        drive.controller.monitor.take_lateral(1e3, drive.now_ns)  # no car's
         heard, *_, silent = [drive.step() for _ in range(40)]
         measured = [from_numbers(list(values.values())).measurement for values in (heard, silent)]
         nothing = pytest.approx(math.nan, nan_ok=True)
         assert [m.acceleration_mps2 for m in measured] == [-3.5, nothing]
         assert [m.yaw_rate_radps for m in measured] == [0.2, nothing]
+        assert [m.lateral_mps2 for m in measured] == [-1.5, nothing]
 
     def test_reset_forgets_inputs_and_memory(self, drive) -> None:
         drive.run(60, demand=9000.0)

@@ -62,6 +62,7 @@ MEASURED = st.builds(
     motor_stuck_nm=four(any_of(-500.0, 500.0) | st.just(0.0)),
     acceleration_mps2=any_of(-30.0, 30.0) | st.just(math.nan),
     yaw_rate_radps=any_of(-10.0, 10.0) | st.just(math.nan),
+    lateral_mps2=any_of(-30.0, 30.0) | st.just(math.nan),
 )
 STATES = st.just(initial_state()) | st.builds(lambda state, yaw: state._replace(yaw=yaw), MEMORIES, YAWS)
 CODES = st.sampled_from([strategy.code for strategy in STRATEGIES.values()])

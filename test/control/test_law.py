@@ -261,6 +261,8 @@ MEMORIES = st.builds(
     yaw=st.just(no_yaw()),
 )
 RATES = st.one_of(st.sampled_from((0.0, 0.02, -0.02)), st.floats(-0.2, 0.2))
+#: What an accelerometer feels beyond speed times yaw rate.
+SLIPPING = st.one_of(st.sampled_from((0.0, 0.2, -0.2, 0.5, -0.5)), st.floats(-3.0, 3.0))
 #: What may be remembered of a gyroscope, much of it on either side of what a rule asks for.
 YAWS = st.builds(
     YawState,
@@ -268,10 +270,13 @@ YAWS = st.builds(
     known_s=st.sampled_from((0.3, 0.255, 0.245, 0.7, 0.0)),
     shown_radps=RATES,
     same_s=st.sampled_from((0.0, 0.095, 0.101)),
+    level_mps2=st.sampled_from((0.0, 0.1, -0.2)),
+    aside_mps=st.sampled_from((0.0, 0.0, 0.69, -0.69, 0.8, -0.8)),
     turned_rad=st.sampled_from((0.01, 0.0041, 0.0039, 0.0, -0.149, -0.151)),
     believed=st.sampled_from((True, True, False)),
     towards_radps=RATES,
     extra_nm=st.sampled_from((400.0, 1.0, MOST_NM, 0.0)),
+    lost=st.booleans(),
 )
 WATCHED = st.builds(
     lambda state, unequal_s, yaw: state._replace(front_unequal_s=unequal_s, yaw=yaw),
@@ -352,10 +357,17 @@ def mirrored(case):
     yaw = case.before.yaw
     return (
         case.m._replace(
-            wheel_speed_radps=tuple(case.m.wheel_speed_radps[i] for i in order), yaw_rate_radps=-case.m.yaw_rate_radps
+            wheel_speed_radps=tuple(case.m.wheel_speed_radps[i] for i in order),
+            yaw_rate_radps=-case.m.yaw_rate_radps,
+            lateral_mps2=-case.m.lateral_mps2,
         ),
         case.before._replace(
-            yaw=yaw._replace(straight_radps=-yaw.straight_radps, shown_radps=-yaw.shown_radps),
+            yaw=yaw._replace(
+                straight_radps=-yaw.straight_radps,
+                shown_radps=-yaw.shown_radps,
+                level_mps2=-yaw.level_mps2,
+                aside_mps=-yaw.aside_mps,
+            ),
             wheels=tuple(case.before.wheels[i] for i in order),
             front_unequal_s=-case.before.front_unequal_s,
             rear_unequal_s=-case.before.rear_unequal_s,
@@ -583,9 +595,17 @@ def test_all_of_it_holds_in_any_step(case):
 
 
 @settings(max_examples=EXAMPLES)
-@given(measurement=measurements(), rate=RATES, state=WATCHED, tuning=TUNINGS, car=st.sampled_from(list(CARS.values())))
-def test_all_of_it_holds_with_a_gyroscope(measurement, rate, state, tuning, car):
-    case = take(measurement._replace(yaw_rate_radps=rate), state, tuning, car)
+@given(
+    measurement=measurements(),
+    rate=RATES,
+    slipping=SLIPPING,
+    state=WATCHED,
+    tuning=TUNINGS,
+    car=st.sampled_from(list(CARS.values())),
+)
+def test_all_of_it_holds_with_a_gyroscope_and_an_accelerometer(measurement, rate, slipping, state, tuning, car):
+    felt = measurement.speed_mps * rate + slipping
+    case = take(measurement._replace(yaw_rate_radps=rate, lateral_mps2=felt), state, tuning, car)
     for check in CHECKS:
         check(case)
 

@@ -41,6 +41,7 @@ MEASUREMENT = Measurement(
     motor_stuck_nm=four(),
     acceleration_mps2=unlike(),
     yaw_rate_radps=unlike(),
+    lateral_mps2=unlike(),
 )
 COMMAND = Command(
     motor_torque_nm=four(),
@@ -104,6 +105,8 @@ def test_every_number_stands_under_its_own_name():
         "accelerometer": 1.0,
         "yaw_rate_radps": MEASUREMENT.yaw_rate_radps,
         "gyroscope": 1.0,
+        "lateral_mps2": MEASUREMENT.lateral_mps2,
+        "lateral_accelerometer": 1.0,
         **of_wheels("{}_motor_torque_nm", COMMAND.motor_torque_nm),
         **of_wheels("{}_friction_torque_nm", COMMAND.friction_torque_nm),
         **of_wheels("{}_brake_gain", COMMAND.brake_gain),
@@ -158,7 +161,12 @@ def test_only_step_zero_is_a_run_s_first(steps):
 
 
 IMU = pytest.mark.parametrize(
-    ("number", "sensor"), [("acceleration_mps2", "accelerometer"), ("yaw_rate_radps", "gyroscope")]
+    ("number", "sensor"),
+    [
+        ("acceleration_mps2", "accelerometer"),
+        ("yaw_rate_radps", "gyroscope"),
+        ("lateral_mps2", "lateral_accelerometer"),
+    ],
 )
 
 

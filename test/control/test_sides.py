@@ -45,7 +45,10 @@ SCENES = range(600 if numba_config.DISABLE_JIT else 1500)
 
 
 #: What is positive to the left, or for the left wheels.
-SIDED = ("front_unequal_s", "rear_unequal_s", "yaw_rate_radps", "straight_radps", "shown_radps")
+SIDED = (
+    *("front_unequal_s", "rear_unequal_s", "yaw_rate_radps", "straight_radps", "shown_radps"),
+    *("lateral_mps2", "level_mps2", "aside_mps"),
+)
 
 
 class Turn:
@@ -253,6 +256,7 @@ class Scene:
             motor_stuck_nm=d.of((0.0,) * 4, (0.0,) * 4, d.four(lambda: d.of(0.0, 20.0, -30.0))),
             acceleration_mps2=d.of(math.nan, d.between(-9.0, 9.0)),
             yaw_rate_radps=d.of(math.nan, d.between(-0.2, 0.2)),
+            lateral_mps2=d.of(math.nan, d.between(-5.0, 5.0)),
         )
 
     def state(self) -> ControllerState:

@@ -7,25 +7,40 @@ import math
 
 import pytest
 
-from iwm_power_manager.control.yaw import MOST_NM, no_yaw, with_yaw, yaw_step
+from iwm_power_manager.control.yaw import (
+    ASIDE_MPS,
+    CALM_RADPS,
+    FELT_MPS2,
+    MOST_NM,
+    NOT_YET_FELT_MPS2,
+    no_yaw,
+    with_yaw,
+    yaw_step,
+)
 
 DT = 0.01
+SPEED = 20.0
 GROWTH = 600.0
 SIDES = pytest.mark.parametrize("side", [1.0, -1.0], ids=["more left", "more right"])
 
 
-def ahead(rate=0.0, time_s=1.0):
+def ahead(rate=0.0, time_s=1.0, slipping=0.0):
     """What is known after wheels that braked alike."""
     yaw = no_yaw()
     for _ in range(round(time_s / DT)):
-        yaw = yaw_step(yaw, rate, 0.0, GROWTH, False, DT)
+        yaw = yaw_step(yaw, rate, SPEED * rate + slipping, SPEED, 0.0, GROWTH, False, DT)
     return yaw
 
 
-def braked(yaw, rates, side=1.0, braking=True, growth=GROWTH, since_s=0.0):
-    """What is known after unequal braking with these yaw rates towards the side with more grip."""
+def braked(yaw, rates, side=1.0, braking=True, growth=GROWTH, since_s=0.0, slipping=0.0, true=None):
+    """What is known after unequal braking with these yaw rates towards the side with more grip.
+
+    `slipping` is what an accelerometer feels beyond speed times the `true` rates (None: those that are shown).
+    """
     for k, rate in enumerate(rates):
-        yaw = yaw_step(yaw, side * rate, side * (since_s + 0.04 + k * DT), growth, braking, DT)
+        felt = SPEED * (rate if true is None else true[k]) + slipping
+        since = side * (since_s + 0.04 + k * DT)
+        yaw = yaw_step(yaw, side * rate, side * felt, SPEED, since, growth, braking, DT)
     return yaw
 
 
@@ -106,12 +121,87 @@ def test_it_grows_to_its_most_only_while_the_car_brakes_and_goes_where_the_wheel
     assert braked(yaw, turning(10.0), since_s=1.0).extra_nm == MOST_NM
     rolling = braked(yaw, [0.001, 0.002], since_s=1.0, braking=False)
     assert rolling.extra_nm == pytest.approx(yaw.extra_nm - 2 * GROWTH * DT)
-    alike = yaw_step(yaw, 0.001, 0.0, GROWTH, True, DT)
+    alike = yaw_step(yaw, 0.001, SPEED * 0.001, SPEED, 0.0, GROWTH, True, DT)
     assert (alike.believed, alike.extra_nm, alike.turned_rad) == (False, 0.0, 0.0)
-    assert yaw_step(yaw, math.nan, 0.0, GROWTH, True, DT) == no_yaw()
+    assert yaw_step(yaw, math.nan, 0.0, SPEED, 0.0, GROWTH, True, DT) == no_yaw()
+
+
+@SIDES
+@pytest.mark.parametrize("level", [0.4, -0.4])
+def test_a_bias_of_the_accelerometer_or_a_camber_changes_nothing(side, level):
+    yaw = braked(ahead(slipping=side * level), turning(4.0), side, slipping=level)
+    assert yaw.extra_nm == pytest.approx(braked(ahead(), turning(4.0), side).extra_nm)
+    assert yaw.extra_nm > 1000.0
+
+
+@SIDES
+def test_the_yaw_rate_counts_within_what_is_felt(side):
+    yaw, calm = believed(side), [0.001 + 1e-6 * k for k in range(10)]
+    turns = [0.001 + CALM_RADPS + FELT_MPS2 / SPEED] * 10
+    shown = braked(yaw, calm, side, since_s=1.0, true=turns)
+    assert shown.extra_nm == pytest.approx(yaw.extra_nm, abs=5.0), "the budget grows no more"
+    assert shown.towards_radps == pytest.approx(CALM_RADPS, abs=0.002)
+    assert shown.believed
+    grip = braked(yaw, calm, side, since_s=1.0)
+    for slipping in (FELT_MPS2 - 0.01, 0.01 - NOT_YET_FELT_MPS2):
+        within = braked(yaw, calm, side, since_s=1.0, slipping=slipping)
+        assert (within.extra_nm, within.towards_radps) == (grip.extra_nm, grip.towards_radps)
+    off = [0.08 + rate for rate in calm]
+    away = braked(yaw, off, side, since_s=1.0, true=[-rate for rate in calm])
+    assert away.towards_radps == pytest.approx(NOT_YET_FELT_MPS2 / SPEED - calm[-1], abs=1e-6), "not 0.08"
+
+
+def test_at_walking_pace_what_is_felt_is_no_large_yaw_rate():
+    slow = yaw_step(believed(), 0.001, FELT_MPS2 + 0.02, 0.1, 1.0, GROWTH, True, DT)
+    assert slow.towards_radps == pytest.approx(0.001 + 0.02, abs=0.001)
+
+
+@SIDES
+@pytest.mark.parametrize("off", [0.08, -0.08, 0.4, -0.4])
+def test_where_both_contradict_each_other_neither_is_believed(side, off):
+    true = turning(3.0)
+    shown = [rate + off for rate in true]
+    states = [believed(side)]
+    for k, (rate, real) in enumerate(zip(shown, true, strict=True)):
+        states.append(braked(states[-1], [rate], side, since_s=1.0 + k * DT, true=[real]))
+    lost = next(k for k, state in enumerate(states) if not state.believed)
+    apart_s = ASIDE_MPS / SPEED / abs(off)
+    assert apart_s <= lost * DT <= 1.4 * apart_s + DT
+    assert states[-1].extra_nm == 0.0
+    assert not braked(states[-1], turning(), side, since_s=5.0).believed, "not in this braking any more"
+
+
+def test_a_car_that_slowly_slips_aside_is_believed():
+    true = [0.001 + 1e-6 * k for k in range(300)]
+    assert braked(believed(), true, since_s=1.0, slipping=0.7 * ASIDE_MPS).believed
+
+
+@pytest.mark.parametrize(("rate", "felt"), [(0.0, math.nan), (math.nan, 0.0)], ids=["gyroscope", "accelerometer"])
+def test_one_of_both_alone_adds_nothing(rate, felt):
+    yaw = believed()
+    for since in (1.0, 1.01):
+        yaw = yaw_step(yaw, rate, felt, SPEED, since, GROWTH, True, DT)
+    assert yaw == no_yaw(believed().extra_nm - 2 * GROWTH * DT)
 
 
 def test_without_growth_the_rate_is_not_used():
     assert braked(ahead(), turning(), growth=0.0) == no_yaw()
     yaw = ahead()
     assert with_yaw((1.0, 2.0), (3.0, 4.0), 0.0, yaw) == ((1.0, 2.0), (3.0, 4.0))
+
+
+@SIDES
+def test_where_the_rate_is_lost_a_car_that_turns_is_still_braked_less_unequally(side):
+    lost = braked(believed(side), [0.5 + 1e-6 * k for k in range(30)], side, since_s=1.0, true=[0.0] * 30)
+    assert (lost.believed, lost.lost) == (False, True)
+    alike = yaw_step(lost, 0.0, 0.0, SPEED, 0.0, GROWTH, True, DT)
+    assert not alike.lost
+    own = 0 if side > 0.0 else 1
+    budgets = [
+        with_yaw((900.0, 900.0), (0.0, 0.0), side, lost._replace(towards_radps=x, extra_nm=0.0))[0]
+        for x in (-0.1, 0.0, 0.05)
+    ]
+    assert [budget[own] for budget in budgets] == pytest.approx([900.0, 900.0, 500.0])
+    assert {budget[1 - own] for budget in budgets} == {900.0}
+    never = no_yaw()._replace(towards_radps=0.05)
+    assert with_yaw((900.0, 900.0), (0.0, 0.0), side, never) == ((900.0, 900.0), (0.0, 0.0))

@@ -110,30 +110,50 @@ def yaw_speed_factor(speed, settings):
 def known_yaw(m, state, settings):
     """What is remembered of the yaw rate: what it was before, whether it is believed, and what it adds."""
     was, unequal, rate, dt = state.yaw, state.front_unequal_s, m.yaw_rate_radps, m.dt_s
+    slipping = m.lateral_mps2 - max(m.speed_mps, 0.0) * rate
     growth = settings.yaw_rate_growth_nmps * yaw_speed_factor(m.speed_mps, settings)
     alike = -0.03 <= unequal <= 0.03
     unknown = was._replace(
-        straight_radps=0.0, known_s=0.0, shown_radps=0.0, same_s=0.0, turned_rad=0.0, believed=False, towards_radps=0.0
+        straight_radps=0.0,
+        known_s=0.0,
+        shown_radps=0.0,
+        same_s=0.0,
+        level_mps2=0.0,
+        aside_mps=0.0,
+        turned_rad=0.0,
+        believed=False,
+        towards_radps=0.0,
     )
     faded = 0.0 if alike else max(0.0, was.extra_nm - dt * growth)
-    if rate != rate or growth == 0.0:
+    unknown = unknown._replace(lost=False)
+    if slipping != slipping or growth == 0.0:
         return unknown._replace(extra_nm=faded)
     if alike:
         heard = min(was.known_s, 0.5)
-        mean = (heard * was.straight_radps + dt * rate) / (heard + dt)
-        return unknown._replace(straight_radps=mean, known_s=was.known_s + dt, shown_radps=rate, extra_nm=0.0)
-    towards = rate - was.straight_radps if unequal > 0.0 else was.straight_radps - rate
+        mean, level = (
+            (heard * old + dt * new) / (heard + dt)
+            for old, new in ((was.straight_radps, rate), (was.level_mps2, slipping))
+        )
+        known = was.known_s + dt
+        return unknown._replace(straight_radps=mean, known_s=known, shown_radps=rate, level_mps2=level, extra_nm=0.0)
+    slipping -= was.level_mps2
+    to_left = rate - was.straight_radps
+    turning = to_left if unequal > 0.0 else -to_left
+    felt = slipping if unequal > 0.0 else -slipping
+    towards = turning + (felt - min(max(felt, -1.0), 0.2)) / max(m.speed_mps, 1.0)
     now = was._replace(
         shown_radps=rate,
         same_s=was.same_s + dt if rate == was.shown_radps else 0.0,
-        turned_rad=was.turned_rad + dt * towards,
+        aside_mps=low_pass(was.aside_mps, slipping, dt, 1.0),
+        turned_rad=was.turned_rad + dt * turning,
         towards_radps=towards,
         extra_nm=faded,
     )
-    if now.same_s > 0.1 or now.turned_rad < -0.15:
+    if now.same_s > 0.1 or now.turned_rad < -0.15 or not -0.7 <= now.aside_mps <= 0.7:
         now = now._replace(known_s=0.0)
     turned_at_first = -1.0 <= unequal <= 1.0 and now.turned_rad > 0.004
     now = now._replace(believed=now.known_s >= 0.25 and (was.believed or turned_at_first))
+    now = now._replace(lost=not now.believed and (was.lost or was.believed))
     if now.believed and m.power_demand_w < 0.0:
         calm = (0.03 - towards) / 0.03 if towards > 0.0 else 1.0
         now = now._replace(extra_nm=min(1500.0, max(0.0, was.extra_nm + dt * growth * calm)))
@@ -163,7 +183,10 @@ def yaw_budget(name, state, settings, speed, braking, yaw):
         return [most, most]
     factor = yaw_speed_factor(speed, settings)
     unequal, lasting = getattr(state, f"{name}_unequal_s"), state.front_unequal_s
-    added = yaw.extra_nm - (16000.0 * max(yaw.towards_radps, 0.0) if yaw.believed else 0.0)
+    damping = 16000.0 if yaw.believed else 0.0
+    if yaw.lost and not yaw.believed:
+        damping = 8000.0
+    added = yaw.extra_nm - damping * max(yaw.towards_radps, 0.0)
     if name == "rear":
         added = 0.3 * max(added, 0.0)
     return [

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from iwm_sim.scenario import Friction, load_scenario
 BASE = load_scenario("split_stop")
 MOST_DEG = 240.0
 MOST_SLIP_ANGLE_DEG = 10.0
+REACTION_S, ARMS_S = steering.REACTION_S, steering.ARMS_S
 
 
 def it_stays_straight(speed_mps, low, times, left_low, imu=False):
@@ -54,12 +56,16 @@ def test_stops_that_once_turned_the_car_round_do_no_more(speed_mps, low, times):
     it_stays_straight(speed_mps, low, times, False)
 
 
-def watched(monkeypatch, shown=lambda rate, time_s: rate, **changes):
-    """The stop of the row, both sides' friction given, with a gyroscope that shows this of the yaw rate."""
+def watched(monkeypatch, shown=lambda rate, time_s: rate, felt=lambda left, time_s: left, slower=1.0, **changes):
+    """The stop of the row, with a gyroscope that shows this of the yaw rate, and an accelerometer that feels this."""
+    monkeypatch.setattr(steering, "REACTION_S", slower * REACTION_S)
+    monkeypatch.setattr(steering, "ARMS_S", slower * ARMS_S)
     give = road_run.give
 
     def give_shown(controller, sensors, drive, now_ns):
-        give(controller, sensors._replace(yaw_rate_radps=shown(sensors.yaw_rate_radps, drive.time_s)), drive, now_ns)
+        now = drive.time_s
+        rate, left = shown(sensors.yaw_rate_radps, now), felt(sensors.lateral_acceleration_mps2, now)
+        give(controller, sensors._replace(yaw_rate_radps=rate, lateral_acceleration_mps2=left), drive, now_ns)
 
     monkeypatch.setattr(road_run, "give", give_shown)
     scenario = dataclasses.replace(BASE, imu=True, **changes)
@@ -69,10 +75,8 @@ def watched(monkeypatch, shown=lambda rate, time_s: rate, **changes):
 @pytest.mark.parametrize("slower", [1.0, 1.5])
 @pytest.mark.parametrize("left_low", [True, False])
 def test_with_a_gyroscope_a_stop_is_shorter_and_also_a_slow_driver_keeps_his_lane(monkeypatch, left_low, slower):
-    monkeypatch.setattr(steering, "REACTION_S", slower * steering.REACTION_S)
-    monkeypatch.setattr(steering, "ARMS_S", slower * steering.ARMS_S)
     sides = (0.2, 0.9) if left_low else (0.9, 0.2)
-    run = watched(monkeypatch, friction=(Friction(-100.0, *sides),))
+    run = watched(monkeypatch, slower=slower, friction=(Friction(-100.0, *sides),))
     assert stopping_distance_m(run) <= 90.0
     assert lane_m(run) <= 3.5
     assert steering_2s_deg(run) <= 120.0
@@ -89,3 +93,78 @@ def test_a_gyroscope_that_fails_during_the_stop_turns_no_car_round(monkeypatch):
     run = watched(monkeypatch, lambda rate, time_s: rate if time_s < 3.0 else np.nan)
     assert lane_m(run) <= 3.5
     assert stopping_distance_m(run) < stopping_distance_m(driven(drive_scenario(BASE), BASE.truth))
+
+
+def late():
+    """A number of 0.2 s ago."""
+    shown = []
+
+    def then(value, _):
+        shown.append(value)
+        return shown[max(len(shown) - 21, 0)]
+
+    return then
+
+
+def held():
+    """A number that comes anew only every 0.2 s."""
+    shown = []
+
+    def then(value, _):
+        shown.append(value)
+        return shown[(len(shown) - 1) // 20 * 20]
+
+    return then
+
+
+#: Lane of the row's stop with a sensor that becomes wrong; 2.5 m without any, 27 m with a gyroscope trusted alone.
+WRONG_LANE_M = 4.1
+NOISE = np.random.default_rng(50000).normal(size=10000)
+#: What a sensor of either kind may show from some time on, of a value and the time since.
+WRONG = {
+    "wrong sign": lambda x, _: -x,
+    "zero and noise": lambda _, s: 0.002 * NOISE[round(100 * s)],
+    "half": lambda x, _: 0.5 * x,
+    "double": lambda x, _: 2.0 * x,
+    "little more": lambda x, _: x + 0.05,
+    "little less": lambda x, _: x - 0.05,
+    "more": lambda x, _: x + 0.2,
+    "less": lambda x, _: x - 0.2,
+    "drifts up": lambda x, s: x + 0.03 * s,
+    "drifts down": lambda x, s: x - 0.03 * s,
+    "wild": lambda x, s: x + 0.2 * NOISE[round(100 * s)],
+    "silent": lambda *_: math.nan,
+}
+
+
+@pytest.mark.parametrize("from_s", [0.7, 1.0, 2.5, 4.0])
+@pytest.mark.parametrize("slower", [1.0, 1.5])
+@pytest.mark.parametrize("kind", WRONG)
+def test_a_gyroscope_that_becomes_wrong_in_any_way_takes_no_car_far_aside(monkeypatch, kind, slower, from_s):
+    run = watched(
+        monkeypatch,
+        lambda rate, time_s: WRONG[kind](rate, time_s - from_s) if time_s >= from_s else rate,
+        slower=slower,
+        friction=(Friction(-100.0, *((0.2, 0.9) if slower == 1.0 else (0.9, 0.2))),),
+    )
+    assert lane_m(run) <= WRONG_LANE_M
+    assert steering_deg(run) <= MOST_DEG
+    assert run.run.final.speed_mps == 0.0
+
+
+@pytest.mark.parametrize("slower", [1.0, 1.5])
+@pytest.mark.parametrize("shown", [late, held])
+def test_a_gyroscope_that_is_late_takes_no_car_far_aside(monkeypatch, shown, slower):
+    run = watched(monkeypatch, shown(), slower=slower)
+    assert lane_m(run) <= WRONG_LANE_M
+    assert steering_deg(run) <= MOST_DEG
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_an_accelerometer_that_becomes_wrong_takes_no_car_far_aside(monkeypatch, kind):
+    run = watched(
+        monkeypatch,
+        felt=lambda left, time_s: 10.0 * WRONG[kind](0.1 * left, time_s - 1.0) if time_s >= 1.0 else left,
+    )
+    assert lane_m(run) <= WRONG_LANE_M
+    assert steering_deg(run) <= MOST_DEG
