@@ -43,7 +43,7 @@ class Waits:
 
     def __init__(self, process_id: int) -> None:
         self._threads = Path(f"/proc/{process_id}/task")
-        self._looks: list[tuple[int, int]] = []
+        self._looks: list[tuple[int, int, int]] = []
 
     def look(self) -> None:
         """Ask Linux, which says nothing where its scheduler keeps no account."""
@@ -51,13 +51,13 @@ class Waits:
         for thread in self._threads.glob("*/schedstat"):
             with suppress(OSError):  # it has just ended
                 waited_ns += int(thread.read_text().split()[1])
-        self._looks.append((began_ns, waited_ns))
+        self._looks.append((began_ns, time.time_ns(), waited_ns))
 
     def between_s(self, begin_ns: int, end_ns: int) -> float:
         """Time they waited, from the last look before to the first one after."""
-        before = max((look for look in self._looks if look[0] <= begin_ns), default=self._looks[0])
+        before = max((look for look in self._looks if look[1] <= begin_ns), default=self._looks[0])
         after = min((look for look in self._looks if look[0] > end_ns), default=self._looks[-1])
-        return (after[1] - before[1]) / NS_PER_S
+        return (after[2] - before[2]) / NS_PER_S
 
 
 def hold(car: RollingCar, process_id: int, length_s: float, phase_s: float, brakes: bool) -> Hold:
