@@ -353,7 +353,8 @@ def test_a_gyroscope_adds_to_both_yaw_budgets_on_the_side_that_the_front_wheels_
     wheels = tuple(rolls * (1.0 if i % 2 == more else 0.5) for i, rolls in enumerate(rolling()))
     seen = no_yaw(400.0)._replace(known_s=0.5, turned_rad=0.01, believed=True)
     before = remembered(speed_radps=wheels)._replace(front_unequal_s=front_s, rear_unequal_s=rear_s, yaw=seen)
-    _, after = step(measured(-300e3, wheels)._replace(yaw_rate_radps=1e-6), before, tuned)
+    m = measured(-300e3, wheels)._replace(yaw_rate_radps=1e-6, lateral_mps2=SPEED * 1e-6)
+    _, after = step(m, before, tuned)
     extra_nm = 400.0 + 600.0 * 0.01
     for first, axle, moment_nm in ((0, CAR.front, extra_nm), (2, CAR.rear, REAR_PART * extra_nm)):
         apart_nm = abs(after.wheels[first + more].total_nm) - abs(after.wheels[first + 1 - more].total_nm)
