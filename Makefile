@@ -80,7 +80,7 @@ coverage: setup-dev  ## Line and branch coverage of control law, limits, gating 
 	@$(BIN)/coverage combine --quiet
 	@$(BIN)/coverage report --include='$(SAFETY)' --fail-under=100
 
-mutation: setup-dev  ## Mutate the same modules: do the tests notice? (an hour; ARGS="--sample 250": minutes)
+mutation: setup-dev  ## Mutate the same modules: do the tests notice? (hours; ARGS=--swaps, front for rear: half an hour)
 	@$(BIN)/python scripts/mutation $(ARGS)
 
 ##@ Parts
