@@ -31,7 +31,7 @@ def cold(start_own: Callable[..., Any], empty_cache: dict[str, str]) -> Any:
 def child_of(pair: Any) -> psutil.Process:
     """The process that compiles, once there is one; stopped, so that it does not end before a test wants it to."""
     node = psutil.Process(pair.running.process.pid)
-    child = pair.bench.spin_until(node.children, "a process that compiles")[0]
+    child = pair.bench.spin_until(node.children, "a process that compiles", 3.0 * PATIENCE_S)[0]
     child.suspend()
     return child
 
@@ -86,11 +86,11 @@ def test_where_the_child_process_is_killed_it_says_so_and_goes_on_without(cold) 
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_however_the_node_ends_the_child_process_ends_with_it(cold, sent) -> None:
     child = child_of(cold)
-    cold.bench.drive(lambda: drives(cold.bench), "torque")
+    cold.bench.drive(lambda: drives(cold.bench), "torque", patience_s=2.0 * PATIENCE_S)
     assert child.status() == psutil.STATUS_STOPPED
     child.resume()
     cold.running.stop(sent)
-    child.wait(PATIENCE_S)
+    child.wait(2.0 * PATIENCE_S)  # it gives way to whatever else runs
 
 
 def test_for_how_long_it_has_been_compiling_is_said(cold) -> None:
