@@ -75,6 +75,53 @@ def _ahead(
     )
 
 
+class _Sample(NamedTuple):
+    """A demand that counts, and what of it is the same for all shares.
+
+    `rolling` is as `ahead.settled` if no wheel slipped; `followed` is the part of its slip that wheels reach.
+    """
+
+    demand_w: float
+    ahead: _Ahead
+    rolling: Settled
+    followed: float
+
+
+@kernel
+def _sample(power_demand_w: float, situation: Situation, vehicle: VehicleParams, policy: PolicyTable) -> _Sample:
+    speed, problem = situation.speed_mps, policy.problem
+    ahead = _ahead(power_demand_w, power_demand_w, situation, vehicle, policy)
+    rolling = settled(power_demand_w, speed, False, vehicle, problem)
+    followed = slip_followed(ahead.settled.force_n, speed, SAMPLE_S, vehicle, problem)
+    return _Sample(power_demand_w, ahead, rolling, followed)
+
+
+@kernel
+def _jittering(situation: Situation, vehicle: VehicleParams, policy: PolicyTable) -> tuple[_Sample, ...]:
+    """The present demand, those before it, as many as a jitter holds, and at the end the mean of those that count."""
+    demand_w, gain, before_w = situation.power_demand_w, situation.jitter.gain, situation.jitter.samples_w
+    weights = weight = gain
+    mean_w = weight * demand_w
+    for i in range(min(SAMPLES, situation.jitter.taken)):
+        weight *= 1.0 - gain
+        mean_w += weight * before_w[i]
+        weights += weight
+    return (
+        _sample(demand_w, situation, vehicle, policy),
+        _sample(before_w[0], situation, vehicle, policy),
+        _sample(before_w[1], situation, vehicle, policy),
+        _sample(before_w[2], situation, vehicle, policy),
+        _sample(before_w[3], situation, vehicle, policy),
+        _sample(before_w[4], situation, vehicle, policy),
+        _sample(before_w[5], situation, vehicle, policy),
+        _sample(before_w[6], situation, vehicle, policy),
+        _sample(before_w[7], situation, vehicle, policy),
+        _sample(before_w[8], situation, vehicle, policy),
+        _sample(before_w[9], situation, vehicle, policy),
+        _sample(mean_w / weights, situation, vehicle, policy),
+    )
+
+
 @kernel
 def _half_believed(power_demand_w: float, situation: Situation, vehicle: VehicleParams, policy: PolicyTable) -> bool:
     """Whether only a part of the forecast is believed: where changes are budgeted, but in braking beyond the motors."""
@@ -121,6 +168,10 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
         trust = TRUST
         steps = TRUST + (1.0 - TRUST) * WORTH_S / policy.problem.dt_s + held
     ahead = _ahead(demand_w, earlier_w, situation, vehicle, policy)
+    now = _Sample(demand_w, ahead, ahead.settled, 1.0)
+    seen: tuple[_Sample, ...] = (now, now, now, now, now, now, now, now, now, now, now, now)
+    if gain <= _LASTING:
+        seen = _jittering(situation, vehicle, policy)
     # Each kernel is called in one place, so that the compiler puts it there: a car and a policy are much to pass on.
     best, most = previous, 0.0
     kept = found = _Outlook(0.0, 0.0, 0.0)
@@ -137,7 +188,7 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
         bound = False
         # Most shares are worth less than the best so far for certain, before anything is solved for them.
         for least in (k >= 0 and policy.problem.slip_model == SLIP_QUASI_STEADY, False):
-            found = _outlook(ahead, situation, share, cell, least, bound, found, level, vehicle, policy)
+            found = _outlook(seen, situation, share, cell, least, bound, found, level, vehicle, policy)
             if k < 0:
                 kept = found
                 break
@@ -159,7 +210,7 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
 
 @kernel
 def _outlook(
-    ahead: _Ahead,
+    seen: tuple[_Sample, ...],
     situation: Situation,
     share: float,
     cell: Ends,
@@ -175,30 +226,28 @@ def _outlook(
     What a tyre's slip does not follow of the jitter costs what the slip of the mean demand costs.
     """
     speed, problem, gain = situation.speed_mps, policy.problem, situation.jitter.gain
-    demand_w = situation.power_demand_w
     samples = min(SAMPLES, situation.jitter.taken) if gain <= _LASTING else 0
     lags = problem.slip_model == SLIP_QUASI_STEADY
-    step = later = earlier = weights = mean_w = unfollowed = 0.0
+    step = later = earlier = weights = unfollowed = 0.0
     weight = gain
-    for i in range(-1, samples + 1 if lags else samples):
-        if i >= 0:
-            demand_w = situation.jitter.samples_w[i] if i < samples else mean_w / weights
-            ahead = _ahead(demand_w, demand_w, situation, vehicle, policy)
-        one = _demand_outlook(ahead, demand_w, situation, share, cell, least, bound, found, level, vehicle, policy)
+    for i in range(samples + 2 if lags else samples + 1):
+        sample = seen[i if i <= samples else SAMPLES + 1]
+        one = _demand_outlook(
+            sample.ahead, sample.demand_w, situation, share, cell, least, bound, found, level, vehicle, policy
+        )
         if gain > _LASTING:
             return one
-        followed, slipless_j = 1.0, one.step_j
+        slipless_j = one.step_j
         if lags:
-            followed = slip_followed(ahead.settled.force_n, speed, SAMPLE_S, vehicle, problem)
-            rolling = settled(demand_w, speed, False, vehicle, problem)
-            slipless_j = settled_step(rolling, demand_w, speed, share, False, False, vehicle, problem).cost_j
+            slipless_j = settled_step(
+                sample.rolling, sample.demand_w, speed, share, False, False, vehicle, problem
+            ).cost_j
         slip_j = one.step_j - slipless_j
-        if i == samples:
+        if i > samples:
             step += unfollowed * slip_j
             break
-        step += weight * (slipless_j + followed * slip_j)
-        unfollowed += weight * (1.0 - followed)
-        mean_w += weight * demand_w
+        step += weight * (slipless_j + sample.followed * slip_j)
+        unfollowed += weight * (1.0 - sample.followed)
         later += weight * one.later_j
         earlier += weight * one.earlier_j
         weights += weight
