@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control import strategies
 from iwm_power_manager.control.budget import Used
-from iwm_power_manager.control.persistence import no_jitter
+from iwm_power_manager.control.persistence import SAMPLES, no_jitter
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.split import decide
 from iwm_power_manager.control.strategies import STRATEGIES, instantaneous
@@ -274,6 +274,23 @@ def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_
         for share, cost in splits.bellman((power, speed, 0.0, 0.0), previous, table, outcome, steps=steps).items():
             total[share] += weight * cost
     assert within_rounding(total, ours, 1e-4)
+
+
+@pytest.mark.parametrize("k", range(SAMPLES))
+def test_each_demand_that_a_jitter_holds_counts_in_its_place(k):
+    # Only one of them has something dear to follow, with the share as it is; all else is less than a change costs.
+    demands = tuple(1000.0 * (i == k) for i in range(SAMPLES))
+    follows = np.zeros((2, 1, 1, 1, len(SHARES)))
+    follows[1, ..., 0] = 1e9
+    table = empty_table(SHARES)._replace(
+        power_w=np.array([0.0, 1000.0]), previous_share=np.array(SHARES), discount=1.0, switching_fixed_cost_j=1e6
+    )
+    jitter = no_jitter()._replace(samples_w=demands, taken=20, gain=0.2)
+    at = situation(0.0, 12.0, previous=SHARES[0])._replace(jitter=jitter)
+    for expected, changes in ((follows, True), (0.0 * follows, False)):
+        chosen = table._replace(expected_cost_j=expected)
+        ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, chosen)
+        assert (ours != SHARES[0]) == changes
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(2, 1.0), (2, -1.0), (3, 1.0), (3, -1.0)])
