@@ -140,8 +140,10 @@ def test_without_the_law_the_friction_brakes_do_what_is_asked_for_and_no_motor_d
     )
     slow = fastest < car.driver.power_speed_floor_mps / min(car.front.wheel.radius_m, car.rear.wheel.radius_m)
     wanted = min(m.power_demand_w, 0.0)
-    assert full or slow or -sum(command.friction_torque_nm) * fastest <= -wanted * (1.0 + 1e-9)
-    assert (sum(command.friction_torque_nm) < 0.0) == (wanted < 0.0 and car.front.friction_brake.max_torque_nm > 0.0)
+    assert full or slow or -sum(command.friction_torque_nm) * fastest <= -wanted * (1.0 + 1e-9) + 1e-300
+    if not -1e-300 < wanted < 0.0:  # of which no torque may be left
+        brakes = car.front.friction_brake.max_torque_nm > 0.0
+        assert (sum(command.friction_torque_nm) < 0.0) == (wanted < 0.0 and brakes)
 
 
 @pytest.mark.parametrize(("front_nm", "rear_nm"), [(300.0, 100.0), (100.0, 300.0)])
