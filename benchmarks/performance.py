@@ -503,8 +503,9 @@ def seconds(found: dict[str, Any] | None) -> str:
 
 def table(results: dict[str, Any]) -> str:
     """The table of all rows, with the machine."""
+    most = max(len(found["now"]["cpu_s"]) for found in results["rows"].values() if "cpu_s" in found.get("now", {}))
     lines = [
-        f"{results['machine']}; processor time, median of {results['repeat']} (least to most), and peak memory; "
+        f"{results['machine']}; processor time, median of up to {most} (least to most), and peak memory; "
         f"load average {results['load']:.1f} of {os.cpu_count()} cores.",
         "",
         "| work | peer | before | now | goal | how exact |",
@@ -673,7 +674,6 @@ def main() -> None:
     stored = json.loads(known.read_text()) if options.rows != every and known.is_file() else {}
     results: dict[str, Any] = {
         "machine": f"{processor}, {os.cpu_count()} cores, Python {platform.python_version()}",
-        "repeat": options.repeat,
         "load": max(os.getloadavg()[0], stored.get("load", 0.0)),
         "rows": stored.get("rows", {}),
         "programs": stored.get("programs", {}),
