@@ -19,10 +19,17 @@ from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
 from iwm_power_manager.model.longitudinal import Moved, Speeds, Torques
 from iwm_power_manager.model.motor import idle_drag_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
-from iwm_power_manager.model.quasi_steady import USABLE_FRICTION, Axles, axles_of, demand_force_n, split_outcome_w
+from iwm_power_manager.model.quasi_steady import (
+    USABLE_FRICTION,
+    Axles,
+    axles_of,
+    demand_force_n,
+    demand_slip,
+    split_outcome_w,
+)
 from iwm_power_manager.model.torque import blend, conversion_speed_radps
 from iwm_power_manager.model.two_axles import UNSURE, Curve, step_from
-from iwm_power_manager.model.tyre import peak_ratio, slip_at_friction, slip_ratio
+from iwm_power_manager.model.tyre import peak_ratio, slip_ratio
 
 #: Where the delivered power is measured: torque times speed at the wheel (sees no power lost in slip), or at the
 
@@ -377,16 +384,16 @@ def settled_step(
 def slip_followed(
     force_n: float, speed_mps: float, held_s: float, vehicle: VehicleParams, problem: ProblemParams
 ) -> float:
-    """Part of the slip of a road force, 0..1, that wheels reach on average while it is held.
+    """Part of the slip of a road force, 0..1, that wheels reach on average while it is held for `held_s`.
 
-    They have to be turned faster, or slower, by the force itself: at a constant one, which lags their slip behind it by
-    m v s / F, with m what their inertia stands for and s the slip. That is hundredths of a second on a slippery road.
+    They have to be turned faster, or slower, by the force itself: at a constant one their slip lags behind the settled
+    one, s, by m v s / F, with m what their inertia stands for (docs/solver.md). That is hundredths of a second on a dry
+    road, and a tenth near the grip of an icy one.
     """
-    mass = vehicle.chassis.mass_kg
-    most = USABLE_FRICTION * problem.friction * peak_ratio(vehicle.front.tyre)
-    used = min(max(force_n / (mass * GRAVITY_MPS2), -most), most)
-    slip = slip_at_friction(used, problem.friction, vehicle.front.tyre)
-    lag_s = (equivalent_mass_kg(vehicle) - mass) * speed_mps * slip / force_n if force_n != 0.0 else 0.0
+    if force_n == 0.0:
+        return 1.0
+    inertia_kg = equivalent_mass_kg(vehicle) - vehicle.chassis.mass_kg
+    lag_s = inertia_kg * speed_mps * demand_slip(force_n, problem.friction, vehicle) / force_n
     if lag_s <= 0.0:
         return 1.0
     return 1.0 - lag_s / held_s * (1.0 - math.exp(-held_s / lag_s))

@@ -181,6 +181,14 @@ def split_outcome_w(
 
 
 @kernel
+def demand_slip(force_n: float, friction: float, vehicle: VehicleParams) -> float:
+    """Slip at which a tyre of the front axle carries its part of a road force, or as much as it may use of the road."""
+    used = force_n / (vehicle.chassis.mass_kg * GRAVITY_MPS2)
+    most = USABLE_FRICTION * friction * peak_ratio(vehicle.front.tyre)
+    return slip_at_friction(min(max(used, -most), most), friction, vehicle.front.tyre)
+
+
+@kernel
 def demand_force_n(
     power_demand_w: float, speed_mps: float, friction: float, slip_aware: bool, vehicle: VehicleParams
 ) -> float:
@@ -194,8 +202,6 @@ def demand_force_n(
     force = power_demand_w / max(speed_mps, floor)
     if not slip_aware:
         return force
-    used = force / (vehicle.chassis.mass_kg * GRAVITY_MPS2)
-    most = USABLE_FRICTION * friction * peak_ratio(vehicle.front.tyre)
-    slip = slip_at_friction(min(max(used, -most), most), friction, vehicle.front.tyre)
+    slip = demand_slip(force, friction, vehicle)
     rim_speed = vehicle.front.wheel.radius_m * wheel_speed_at_slip(slip, speed_mps, vehicle.front.wheel.radius_m)
     return power_demand_w / max(rim_speed, floor)

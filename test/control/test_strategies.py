@@ -273,7 +273,7 @@ def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_
 
         for share, cost in splits.bellman((power, speed, 0.0, 0.0), previous, table, outcome, steps=steps).items():
             total[share] += weight * cost
-    assert within_rounding(total, ours, 1e-4)
+    assert within_rounding(total, ours, 1e-6)
 
 
 @pytest.mark.parametrize("k", range(SAMPLES))

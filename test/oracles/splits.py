@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.integrate import quad
 from scipy.interpolate import RegularGridInterpolator
 
 from oracles.physics import axle_w, battery_w, normal_forces, road_load, slip_for, torque_limit
@@ -72,8 +73,8 @@ def lagging(demands, weights, speed, settled_j, problem, vehicle):
         rim = speed / (1.0 - slip) if demand > 0.0 else speed * (1.0 - slip)
         force = abs(demand) / max(rim, vehicle.driver.power_speed_floor_mps)
         lag = inertia * speed * mean_slip(force, problem.friction, vehicle) / force
-        times = np.linspace(0.0, 0.1, 20001)
-        return float(np.trapezoid(1.0 - np.exp(-times / lag), times)) / 0.1
+        found, _ = quad(lambda time: 1.0 - math.exp(-time / lag), 0.0, 0.1, points=[min(5.0 * lag, 0.1)], epsrel=1e-12)
+        return found / 0.1
 
     def slip_j(demand, share):
         power, _ = split_w(demand / speed, speed, share, problem.friction, False, vehicle)

@@ -117,8 +117,20 @@ def held():
     return then
 
 
-#: Lane of the row's stop with a sensor that becomes wrong; 2.5 m without any, 27 m with a gyroscope trusted alone.
-WRONG_LANE_M = 4.1
+#: Lane of the row's stop with a sensor that becomes wrong, and of a slow driver's; 2.5 m without any, 27 m with a
+#: gyroscope trusted alone.
+WRONG_LANE_M = {1.0: 3.5, 1.5: 3.7}
+#: Where more is needed (docs/safety.md): kind, driver and from when; and the most that is.
+FARTHER = {
+    *(("double", slower, from_s) for slower in (1.0, 1.5) for from_s in (0.7, 1.0)),
+    ("more", 1.5, 2.5),
+    ("more", 1.5, 4.0),
+    ("wild", 1.5, 1.0),
+    ("less", 1.0, 4.0),
+    ("accelerometer drifts down", 1.0, 1.0),
+    ("accelerometer little less", 1.0, 1.0),
+}
+FARTHEST_M = 4.1
 NOISE = np.random.default_rng(50000).normal(size=10000)
 #: What a sensor of either kind may show from some time on, of a value and the time since.
 WRONG = {
@@ -137,6 +149,13 @@ WRONG = {
 }
 
 
+def stays_near(run, *case):
+    """The car keeps about its lane, the driver in reach, and it stops."""
+    assert lane_m(run) <= (FARTHEST_M if case in FARTHER else WRONG_LANE_M[case[1]])
+    assert steering_deg(run) <= MOST_DEG
+    assert run.run.final.speed_mps == 0.0
+
+
 @pytest.mark.parametrize("from_s", [0.7, 1.0, 2.5, 4.0])
 @pytest.mark.parametrize("slower", [1.0, 1.5])
 @pytest.mark.parametrize("kind", WRONG)
@@ -147,17 +166,13 @@ def test_a_gyroscope_that_becomes_wrong_in_any_way_takes_no_car_far_aside(monkey
         slower=slower,
         friction=(Friction(-100.0, *((0.2, 0.9) if slower == 1.0 else (0.9, 0.2))),),
     )
-    assert lane_m(run) <= WRONG_LANE_M
-    assert steering_deg(run) <= MOST_DEG
-    assert run.run.final.speed_mps == 0.0
+    stays_near(run, kind, slower, from_s)
 
 
 @pytest.mark.parametrize("slower", [1.0, 1.5])
 @pytest.mark.parametrize("shown", [late, held])
 def test_a_gyroscope_that_is_late_takes_no_car_far_aside(monkeypatch, shown, slower):
-    run = watched(monkeypatch, shown(), slower=slower)
-    assert lane_m(run) <= WRONG_LANE_M
-    assert steering_deg(run) <= MOST_DEG
+    stays_near(watched(monkeypatch, shown(), slower=slower), shown.__name__, slower, 0.0)
 
 
 @pytest.mark.parametrize("kind", WRONG)
@@ -166,5 +181,4 @@ def test_an_accelerometer_that_becomes_wrong_takes_no_car_far_aside(monkeypatch,
         monkeypatch,
         felt=lambda left, time_s: 10.0 * WRONG[kind](0.1 * left, time_s - 1.0) if time_s >= 1.0 else left,
     )
-    assert lane_m(run) <= WRONG_LANE_M
-    assert steering_deg(run) <= MOST_DEG
+    stays_near(run, f"accelerometer {kind}", 1.0, 1.0)

@@ -98,7 +98,7 @@ def _sample(power_demand_w: float, situation: Situation, vehicle: VehicleParams,
 
 @kernel
 def _jittering(situation: Situation, vehicle: VehicleParams, policy: PolicyTable) -> tuple[_Sample, ...]:
-    """The present demand, those before it, as many as a jitter holds, and at the end the mean of those that count."""
+    """The present demand, all those before it that a jitter holds, and at the end the mean of those that count."""
     demand_w, gain, before_w = situation.power_demand_w, situation.jitter.gain, situation.jitter.samples_w
     weights = weight = gain
     mean_w = weight * demand_w
@@ -106,6 +106,7 @@ def _jittering(situation: Situation, vehicle: VehicleParams, policy: PolicyTable
         weight *= 1.0 - gain
         mean_w += weight * before_w[i]
         weights += weight
+    # Written out, since kernels make no arrays and numba no tuples in a loop; as many as `SAMPLES`.
     return (
         _sample(demand_w, situation, vehicle, policy),
         _sample(before_w[0], situation, vehicle, policy),
