@@ -209,6 +209,8 @@ def unseen_summary(frontiers: Sequence[Frontier]) -> dict[str, Any]:
         "alone_drawn": len(drawn),
         "busiest_minute": max(point.busiest_minute for _, point, _ in judged),
         "part_above_10": sum(point.changes_per_min > 10.0 for _, point, _ in judged) / len(judged),
+        "behind_equal_points": [-point.saving_percent for _, point, _ in judged if point.saving_percent < 0.0],
+        "far_behind": [sum(row[2][k] < -unseen.WORST for row in judged) for k in range(len(COUNTS))],
         "most_changes_per_min": max(point.changes_per_min for _, point, _ in judged),
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in unseen.judge(frontiers)],
         "swings": unseen.judge(frontiers, (SWINGS,)),
@@ -296,7 +298,9 @@ def unseen_verdicts(found: dict[str, Any]) -> str:
         f"saving. In the other {rivals['cells']} cells: mean {rivals['mean']:+.3f}, median {rivals['median']:+.3f}, "
         f"worst {rivals['worst']:+.3f}, {100 * rivals['close'][0]:.1f} % at most {unseen.CLOSE:g} behind. The paper's "
         f"car alone: {own['cells']} cells, mean {own['mean']:+.3f}, median {own['median']:+.3f}, "
-        f"{100 * own['close'][0]:.1f} %.{swings}"
+        f"{100 * own['close'][0]:.1f} %.{swings} More than {unseen.WORST:g} behind are "
+        f"{' / '.join(map(str, found['far_behind']))} cells by the three counts; behind equal split itself "
+        f"{len(found['behind_equal_points'])}, by {max(found['behind_equal_points'], default=0.0):.3f} at most."
     )
 
 
