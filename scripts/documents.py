@@ -209,7 +209,7 @@ def unseen_summary(frontiers: Sequence[Frontier]) -> dict[str, Any]:
         "alone_drawn": len(drawn),
         "busiest_minute": max(point.busiest_minute for _, point, _ in judged),
         "part_above_10": sum(point.changes_per_min > 10.0 for _, point, _ in judged) / len(judged),
-        "behind_equal_points": [-point.saving_percent for _, point, _ in judged if point.saving_percent < 0.0],
+        "behind_equal_points": [-saved for _, point, _ in judged if (saved := point.saving_percent or 0.0) < 0.0],
         "far_behind": [sum(row[2][k] < -unseen.WORST for row in judged) for k in range(len(COUNTS))],
         "most_changes_per_min": max(point.changes_per_min for _, point, _ in judged),
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in unseen.judge(frontiers)],
