@@ -90,9 +90,9 @@ def give(controller: Controller, sensors: Sensors, drive: Drive, now_ns: int) ->
     monitor = controller.monitor
     monitor.direction = float(sensors.direction)
     if drive.scenario.imu:
-        monitor.take_acceleration(sensors.acceleration_mps2, now_ns)
-        monitor.take_yaw_rate(sensors.yaw_rate_radps, now_ns)
-        monitor.take_lateral(sensors.lateral_acceleration_mps2, now_ns)
+        monitor.take_motion("longitudinal_acceleration", sensors.acceleration_mps2, now_ns)
+        monitor.take_motion("yaw_rate", sensors.yaw_rate_radps, now_ns)
+        monitor.take_motion("lateral_acceleration", sensors.lateral_acceleration_mps2, now_ns)
     if not drive.lost("vehicle_speed") and not math.isnan(sensors.speed_mps):
         monitor.take_speed(SpeedReading(now_ns, sensors.speed_mps), now_ns)
     if not drive.lost("wheel_states"):

@@ -128,8 +128,8 @@ class ScriptedDrive:
                     self.controller.monitor.direction = self.direction(i)
                 if self.moving and shown:
                     bag.write(moving[0], log, imu(now, *shown), log, i + 1)
-                    self.controller.monitor.take_yaw_rate(shown[0], now)
-                    self.controller.monitor.take_acceleration(shown[1], now)
+                    self.controller.monitor.take_motion("yaw_rate", shown[0], now)
+                    self.controller.monitor.take_motion("longitudinal_acceleration", shown[1], now)
                 for number, data in (
                     (speed_topic, twist(now, speed)),
                     (wheel_topic, wheel_states(now, wheels)),

@@ -236,9 +236,9 @@ class Controller:
             motor_gain=gains,
             direction=monitor.direction,
             motor_stuck_nm=self.actuators.stuck_nm,
-            acceleration_mps2=monitor.acceleration_mps2(now_ns),
-            yaw_rate_radps=monitor.yaw_rate_radps(now_ns),
-            lateral_mps2=monitor.lateral_mps2(now_ns),
+            acceleration_mps2=monitor.motion("longitudinal_acceleration", now_ns),
+            yaw_rate_radps=monitor.motion("yaw_rate", now_ns),
+            lateral_mps2=monitor.motion("lateral_acceleration", now_ns),
         )
 
     def _settings(self) -> Settings:

@@ -38,8 +38,7 @@ FRICTION = "road_friction"
 
 _NS_PER_S = 1e9
 #: An accelerometer or a gyroscope that shows more, m/s2 and rad/s, or is silent for longer, s, says nothing.
-_MOST_MPS2 = 30.0
-_MOST_RADPS = 10.0
+_MOST_OF_IMU = {"longitudinal_acceleration": 30.0, "lateral_acceleration": 30.0, "yaw_rate": 10.0}
 _IMU_OLDEST_S = 0.1
 #: Refused for what was accepted before, not for what they are.
 _REFUSED_BY_ANOTHER = (Violation.TOO_FAST, Violation.STAMP_NOT_NEWER)
@@ -206,12 +205,6 @@ class Tally:
         return False
 
 
-def _heard(last: tuple[float, int], now_ns: int) -> float:
-    """The last number of an optional sensor, with its time; NaN where it has been silent for long."""
-    value, heard_ns = last
-    return value if now_ns - heard_ns <= _IMU_OLDEST_S * _NS_PER_S else math.nan
-
-
 class InputMonitor:
     """Latest good inputs.
 
@@ -247,9 +240,7 @@ class InputMonitor:
         self.friction = math.nan
         self.verdicts = (WheelVerdict.GOOD,) * 4
         self.motor_torque_nm: Wheels | None = None
-        self._acceleration = (math.nan, 0)
-        self._yaw_rate = (math.nan, 0)
-        self._lateral = (math.nan, 0)
+        self._motion: dict[str, tuple[float, int]] = {}
         self._wheel_memory = NEW_WHEELS
         self.forget_times()
 
@@ -364,40 +355,14 @@ class InputMonitor:
         return reported
 
     def take_motion(self, signal: str, value: float, now_ns: int) -> None:
-        """Keep a signal of the car's motion that the law uses."""
-        if signal == "longitudinal_acceleration":
-            self.take_acceleration(value, now_ns)
-        elif signal == "yaw_rate":
-            self.take_yaw_rate(value, now_ns)
-        elif signal == "lateral_acceleration":
-            self.take_lateral(value, now_ns)
+        """Keep what an IMU shows: a signal that the law uses, within what a car does; to the left is positive."""
+        if abs(value) <= _MOST_OF_IMU.get(signal, -1.0):
+            self._motion[signal] = (value, now_ns)
 
-    def take_acceleration(self, acceleration_mps2: float, now_ns: int) -> None:
-        """Keep what an accelerometer shows, forward."""
-        if abs(acceleration_mps2) <= _MOST_MPS2:
-            self._acceleration = (acceleration_mps2, now_ns)
-
-    def acceleration_mps2(self, now_ns: int) -> float:
-        """Acceleration as an accelerometer shows it; NaN where there is none, or it has been silent for long."""
-        return _heard(self._acceleration, now_ns)
-
-    def take_yaw_rate(self, yaw_rate_radps: float, now_ns: int) -> None:
-        """Keep what a gyroscope shows, positive to the left."""
-        if abs(yaw_rate_radps) <= _MOST_RADPS:
-            self._yaw_rate = (yaw_rate_radps, now_ns)
-
-    def yaw_rate_radps(self, now_ns: int) -> float:
-        """Yaw rate as a gyroscope shows it; NaN where there is none, or it has been silent for long."""
-        return _heard(self._yaw_rate, now_ns)
-
-    def take_lateral(self, lateral_mps2: float, now_ns: int) -> None:
-        """Keep what an accelerometer shows to the side, positive to the left."""
-        if abs(lateral_mps2) <= _MOST_MPS2:
-            self._lateral = (lateral_mps2, now_ns)
-
-    def lateral_mps2(self, now_ns: int) -> float:
-        """Lateral acceleration as an accelerometer shows it; NaN where there is none, or it has long been silent."""
-        return _heard(self._lateral, now_ns)
+    def motion(self, signal: str, now_ns: int) -> float:
+        """What an IMU shows; NaN where there is none, or it has been silent for long."""
+        value, heard_ns = self._motion.get(signal, (math.nan, now_ns))
+        return value if now_ns - heard_ns <= _IMU_OLDEST_S * _NS_PER_S else math.nan
 
     def take_demand(self, demand_w: float, delay_s: float, now_ns: int, lag_s: float = 0.0) -> bool:
         """Judge `power_demand`, received `delay_s` after it was sent; True if it was accepted.

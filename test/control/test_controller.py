@@ -369,11 +369,11 @@ class TestRecord:
 
     def test_what_an_imu_shows_is_recorded_and_so_is_its_silence(self, drive) -> None:
         drive.run(60, demand=9000.0)
-        drive.controller.monitor.take_acceleration(-3.5, drive.now_ns)
-        drive.controller.monitor.take_yaw_rate(0.2, drive.now_ns)
-        drive.controller.monitor.take_yaw_rate(-10.1, drive.now_ns)  # no car's
-        drive.controller.monitor.take_lateral(-1.5, drive.now_ns)
-        drive.controller.monitor.take_lateral(1e3, drive.now_ns)  # no car's
+        drive.controller.monitor.take_motion("longitudinal_acceleration", -3.5, drive.now_ns)
+        drive.controller.monitor.take_motion("yaw_rate", 0.2, drive.now_ns)
+        drive.controller.monitor.take_motion("yaw_rate", -10.1, drive.now_ns)  # no car's
+        drive.controller.monitor.take_motion("lateral_acceleration", -1.5, drive.now_ns)
+        drive.controller.monitor.take_motion("lateral_acceleration", 1e3, drive.now_ns)  # no car's
         heard, *_, silent = [drive.step() for _ in range(40)]
         measured = [from_numbers(list(values.values())).measurement for values in (heard, silent)]
         nothing = pytest.approx(math.nan, nan_ok=True)

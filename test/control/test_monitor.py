@@ -421,16 +421,16 @@ class TestMotorTorques:
 
 class TestAccelerometer:
     def test_it_is_heard_for_a_tenth_of_a_second(self, monitor) -> None:
-        assert math.isnan(monitor.acceleration_mps2(NOW))
-        monitor.take_acceleration(-3.0, NOW)
-        assert monitor.acceleration_mps2(NOW + 90_000_000) == -3.0
-        assert math.isnan(monitor.acceleration_mps2(NOW + 110_000_000))
+        assert math.isnan(monitor.motion("longitudinal_acceleration", NOW))
+        monitor.take_motion("longitudinal_acceleration", -3.0, NOW)
+        assert monitor.motion("longitudinal_acceleration", NOW + 90_000_000) == -3.0
+        assert math.isnan(monitor.motion("longitudinal_acceleration", NOW + 110_000_000))
 
     @pytest.mark.parametrize("value", [math.nan, math.inf, 1e3])
     def test_what_no_car_does_is_not_believed(self, monitor, value) -> None:
-        monitor.take_acceleration(2.0, NOW)
-        monitor.take_acceleration(value, NOW)
-        assert monitor.acceleration_mps2(NOW) == 2.0
+        monitor.take_motion("longitudinal_acceleration", 2.0, NOW)
+        monitor.take_motion("longitudinal_acceleration", value, NOW)
+        assert monitor.motion("longitudinal_acceleration", NOW) == 2.0
 
 
 class TestCompleteness:

@@ -368,9 +368,13 @@ def test_what_an_imu_shows_reaches_the_law_each_number_its_own() -> None:
     monitor = InputMonitor(messages.WHEEL_NAMES, input_limits(Thresholds(), 0.33, by_clock=True))
     for signal, value in (("yaw_rate", 0.5), ("longitudinal_acceleration", -2.0), ("lateral_acceleration", 7.0)):
         judge(monitor, MotionReading(0, signal, value), 0)
-    assert (monitor.yaw_rate_radps(0), monitor.acceleration_mps2(0), monitor.lateral_mps2(0)) == (0.5, -2.0, 7.0)
-    assert math.isnan(monitor.yaw_rate_radps(200_000_000)), "silent for long"
-    assert math.isnan(monitor.lateral_mps2(200_000_000)), "silent for long"
+    assert (
+        monitor.motion("yaw_rate", 0),
+        monitor.motion("longitudinal_acceleration", 0),
+        monitor.motion("lateral_acceleration", 0),
+    ) == (0.5, -2.0, 7.0)
+    assert math.isnan(monitor.motion("yaw_rate", 200_000_000)), "silent for long"
+    assert math.isnan(monitor.motion("lateral_acceleration", 200_000_000)), "silent for long"
 
 
 def test_a_rate_is_told_whatever_pause_was_in_between() -> None:
