@@ -9,16 +9,20 @@ import os
 import random
 import signal
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
+from bench import PATIENCE_S
+from rclpy.executors import SingleThreadedExecutor
 from rolling_car import Heard, RollingCar
 from sensor_msgs.msg import JointState
 
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.control.thresholds import Thresholds
+from iwm_power_manager.nodes.power_manager_outputs import Outputs
 from iwm_power_manager.ros import messages, qos
 
 T = Thresholds()
@@ -143,6 +147,43 @@ def run(start_pair, count: int, seed: int) -> list[Hold]:
     assert "the clock stands still" not in pair.running.text()  # nobody simulates one
     assert all("(" in line for line in pair.running.text().splitlines() if "waits for" in line)
     return found
+
+
+def test_a_command_that_got_old_before_it_could_be_published_never_is(node, monkeypatch) -> None:
+    """A stop between the law and DDS, where the stops below hardly ever are."""
+    stamps_ns: list[int] = []
+    profile = qos.profile(lockstep=True)
+    node.create_subscription(
+        JointState,
+        messages.WHEEL_TORQUE_COMMAND,
+        lambda m: stamps_ns.append(messages.stamp_to_ns(m.header.stamp)),
+        profile,
+    )
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    assert node.start()
+
+    def until(condition: Callable[[], Any]) -> None:
+        end_s = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < end_s
+            executor.spin_once(timeout_sec=0.1)
+
+    until(lambda: stamps_ns)
+    held_ns: list[int] = []
+    answer = Outputs.answer
+
+    def held(self: Outputs, stamp_ns: int, step: Any) -> Any:
+        made = answer(self, stamp_ns, step)
+        if not held_ns:
+            held_ns.append(stamp_ns)
+            time.sleep(T.command_oldest_s)  # the stop itself
+        return made
+
+    monkeypatch.setattr(Outputs, "answer", held)
+    until(lambda: held_ns and stamps_ns[-1] > held_ns[0])
+    executor.shutdown()
+    assert held_ns[0] not in stamps_ns
 
 
 def test_no_old_command_is_published_after_a_stop(start_pair) -> None:
