@@ -34,7 +34,8 @@ from iwm_power_manager.control.table import PolicyTable
 from iwm_power_manager.control.types import Command, ControllerState, Measurement, Wheels, initial_state
 from iwm_power_manager.model.parameters import VehicleParams
 
-#: While a wheel is lost, slip is judged this much more strictly: its axle is watched through one wheel only.
+#: While a wheel is lost, slip is judged this much more strictly: its axle is watched through one wheel only. What the
+#: car slows down within the limiter's time constant, by which this trails its target, is to be as much less.
 LOST_WHEEL_SLIP_FACTOR = 0.75
 #: Acceleration that motors are asked for which all seem dead, m/s2: no jolt if they come back, on ice either.
 TRIED_MPS2 = 0.6
@@ -250,5 +251,6 @@ class Controller:
         return settings._replace(
             critical_slip=settings.critical_slip * factor,
             slip_target=settings.slip_target * factor,
+            slip_limiter_s=settings.slip_limiter_s * factor,
             gate_hysteresis=settings.gate_hysteresis * factor,
         )

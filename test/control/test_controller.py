@@ -274,6 +274,7 @@ class TestLostWheel:
         assert values["setting.critical_slip"] == default_settings("equal").critical_slip * 0.75
         assert values["setting.slip_target"] == default_settings("equal").slip_target * 0.75
         assert values["setting.gate_hysteresis"] == default_settings("equal").gate_hysteresis * 0.75
+        assert values["setting.slip_limiter_s"] == default_settings("equal").slip_limiter_s * 0.75
         assert values["mode"] == MODE_NORMAL
         assert min(motor(values)) > 0.0
         values = drive.run(100)

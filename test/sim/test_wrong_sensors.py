@@ -164,6 +164,19 @@ def test_a_wheel_that_shows_a_slip_it_does_not_have_takes_no_brakes_at_the_limit
     it_brakes(speed_mps, power_w, 0.5, (broken,))
 
 
+@pytest.mark.parametrize(
+    ("speed_mps", "power_w", "broken"),
+    [
+        (5.71, 43.562e3, wrong("wheel_front_left", "stuck", 0.0, 0.0)),
+        (9.75, 44.89e3, wrong("wheel_front_right", "factor", -0.075, 0.0)),
+        (5.08, 31.631e3, wrong("wheel_front_left", "value", 31.441, 0.0)),
+    ],
+)
+def test_a_wheel_that_is_not_believed_takes_no_brakes_in_a_stop_at_the_limit_from_low_speed(speed_mps, power_w, broken):
+    """Slip is judged more strictly, but by no more than is meant: the limiter trails its target."""
+    it_brakes(speed_mps, power_w, 0.9, (broken,))
+
+
 @pytest.mark.parametrize("friction", [0.2, 0.5, 0.9])
 def test_a_speed_that_is_a_little_too_high_takes_no_brakes_for_good_at_the_limit(friction):
     """Slower, it looks like slip, until the torque is gone and the wheels do not come back: that lasted to the end."""
