@@ -89,12 +89,13 @@ def _capacities_nm(left: Wheel, right: Wheel, moments_nm: tuple[float, float], a
 def unequal_s(before_s: float, left: Wheel, right: Wheel, wanted: bool, dt_s: float) -> float:
     """How long an axle has braked unequally, or would have without a yaw budget: > 0 more left, < 0 more right.
 
-    What was steered for one side is nothing for the other: the time goes back through zero.
+    What was steered for one side is nothing for the other: the time goes back through zero; at once where one wheel
+    stands in for the other, which is not believed: there may have been no difference at all.
     """
     left_capacity, right_capacity = capacity_nm(left), capacity_nm(right)
     if wanted and abs(left_capacity - right_capacity) > UNEQUAL_PART * max(left_capacity, right_capacity):
         return before_s + dt_s if left_capacity > right_capacity else before_s - dt_s
-    left_over = max(abs(before_s) - dt_s, 0.0)
+    left_over = 0.0 if left.speed_radps == right.speed_radps else max(abs(before_s) - dt_s, 0.0)
     return left_over if before_s > 0.0 else -left_over
 
 

@@ -176,13 +176,25 @@ def test_a_car_that_turns_round_remembers_each_wheel_as_itself(wheel):
 @WHEELS
 @pytest.mark.parametrize("demand", [-12e3, 12e3])
 def test_each_axle_remembers_how_long_its_own_wheels_braked_unequally(wheel, demand):
-    wheels = one(wheel, 0.75 * rolling()[wheel], rolling())
+    apart = tuple((1.0 if i % 2 else 0.9999) * speed for i, speed in enumerate(rolling()))
+    wheels = one(wheel, 0.75 * rolling()[wheel], apart)
     before = remembered(speed_radps=wheels)._replace(front_unequal_s=0.5, rear_unequal_s=-0.2)
     _, after = step(measured(demand, wheels), before)
     more = 0.01 if wheel % 2 else -0.01
     braked = demand < 0.0
     assert after.front_unequal_s == pytest.approx(0.5 + (more if braked and wheel < 2 else -0.01))
     assert after.rear_unequal_s == pytest.approx(-0.2 + (more if braked and wheel >= 2 else 0.01))
+
+
+@pytest.mark.parametrize("axle", ["front", "rear"])
+def test_where_one_wheel_stands_in_for_the_other_an_axle_has_braked_unequally_for_no_time(axle):
+    other = "rear" if axle == "front" else "front"
+    apart = tuple((1.0 if i % 2 else 0.9999) * speed for i, speed in enumerate(rolling()))
+    wheels = (*apart[:2], *rolling()[2:]) if axle == "rear" else (*rolling()[:2], *apart[2:])
+    before = remembered(speed_radps=wheels)._replace(front_unequal_s=0.5, rear_unequal_s=0.5)
+    _, after = step(measured(-12e3, wheels), before)
+    assert getattr(after, f"{axle}_unequal_s") == 0.0
+    assert getattr(after, f"{other}_unequal_s") == pytest.approx(0.49)
 
 
 def test_each_axle_has_its_own_brakes_motors_and_radius():

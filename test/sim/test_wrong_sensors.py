@@ -177,6 +177,12 @@ def test_a_wheel_that_is_not_believed_takes_no_brakes_in_a_stop_at_the_limit_fro
     it_brakes(speed_mps, power_w, 0.9, (broken,))
 
 
+@pytest.mark.parametrize(("speed_mps", "at_s"), [(14.94, 1.5), (13.9, 0.3)])
+def test_a_front_wheel_that_sticks_in_a_stop_takes_the_rear_ones_no_brakes_once_it_is_found(speed_mps, at_s):
+    """Until then the road had looked like two, and the rear wheels kept their grip for the steering."""
+    it_brakes(speed_mps, 60e3, 0.5, (wrong("wheel_front_left", "stuck", 0.0, at_s),))
+
+
 @pytest.mark.parametrize("friction", [0.2, 0.5, 0.9])
 def test_a_speed_that_is_a_little_too_high_takes_no_brakes_for_good_at_the_limit(friction):
     """Slower, it looks like slip, until the torque is gone and the wheels do not come back: that lasted to the end."""
