@@ -19,7 +19,7 @@ from iwm_power_manager.control.axle import (
     yaw_moments_nm,
 )
 from iwm_power_manager.control.one_road import least_road_nm
-from iwm_power_manager.control.settings import GATE_MODE_OFF, Settings
+from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.slip import worse_slip
 from iwm_power_manager.control.split import split
 from iwm_power_manager.control.table import PolicyTable
@@ -49,7 +49,7 @@ ROUNDING = 1e-12
 def drive(
     measurement: Measurement,
     state: ControllerState,
-    slip_control: bool,
+    rolls_back: bool,
     lower_part: float,
     settings: Settings,
     vehicle: VehicleParams,
@@ -61,7 +61,7 @@ def drive(
     ----------
     measurement : speeds that are believed
     state : of the step before
-    slip_control : gate and slip limiter may act
+    rolls_back : braked in the direction that nobody asked for
     lower_part : a power that brakes is divided by this part of the speed (`motion.Motion`)
     """
     speed = max(measurement.speed_mps, 0.0)
@@ -93,7 +93,6 @@ def drive(
     memory = split(measurement, speed, front_slip, rear_slip, first, state.split, settings, vehicle, policy)
 
     # 3. gate, 4. capacity
-    mode = settings.gate_mode if slip_control else GATE_MODE_OFF
     slips = (fl_slip, fr_slip, rl_slip, rr_slip)
     # Of wheels that are alike none slips alone.
     least_nm = (0.0, 0.0, 0.0, 0.0) if front_alike and rear_alike else least_road_nm(before, vehicle)
@@ -102,15 +101,15 @@ def drive(
     if braking:
         front_nm, rear_nm = with_yaw(front_nm, rear_nm, front_s, yaw)
     front = pair_of(
-        0, measurement, slips, speed, lower_part, mode, targets, least_nm, front_nm, first, before, front_alike,
+        0, measurement, slips, speed, lower_part, targets, least_nm, front_nm, first, before, front_alike,
         vehicle.front, s, vehicle,
     )  # fmt: skip
     rear = pair_of(
-        2, measurement, slips, speed, lower_part, mode, targets, least_nm, rear_nm, first, before, rear_alike,
+        2, measurement, slips, speed, lower_part, targets, least_nm, rear_nm, first, before, rear_alike,
         vehicle.rear, s, vehicle,
     )  # fmt: skip
-    # Without slip control nothing keeps a single axle from locking.
-    share = memory.applied_share if slip_control else 0.5
+    # No strategy knows of a car that rolls back: both axles brake alike.
+    share = 0.5 if rolls_back else memory.applied_share
     axle_slips = front_slip, rear_slip
     return _commanded(measurement, speed, front, rear, axle_slips, memory, yaw, share, state, settings, vehicle)
 

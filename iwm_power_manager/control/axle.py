@@ -160,7 +160,6 @@ def pair_of(
     slips: Wheels,
     speed_mps: float,
     lower_part: float,
-    gate_mode: int,
     targets: Wheels,
     least_nm: Wheels,
     moments_nm: tuple[float, float],
@@ -175,16 +174,16 @@ def pair_of(
     m = measurement
     w, gain, demand, dt = m.wheel_speed_radps, m.motor_gain, m.power_demand_w, m.dt_s
     left_gate, right_gate = slips[k], slips[k + 1]
-    if gate_mode == GATE_MODE_TABLE2:
+    if settings.gate_mode == GATE_MODE_TABLE2:
         left_gate = right_gate = worse_slip(slips[k], slips[k + 1])
     left = wheel_of(
-        w[k], slips[k], left_gate, speed_mps, demand, gain[k], lower_part, gate_mode, targets[k], least_nm[k], dt,
+        w[k], slips[k], left_gate, speed_mps, demand, gain[k], lower_part, targets[k], least_nm[k], dt,
         first, before[k], w[k + 1], before[k + 1], axle, settings, vehicle,
     )  # fmt: skip
     right = left
     if not alike:
         right = wheel_of(
-            w[k + 1], slips[k + 1], right_gate, speed_mps, demand, gain[k + 1], lower_part, gate_mode, targets[k + 1],
+            w[k + 1], slips[k + 1], right_gate, speed_mps, demand, gain[k + 1], lower_part, targets[k + 1],
             least_nm[k + 1], dt, first, before[k + 1], w[k], before[k], axle, settings, vehicle,
         )  # fmt: skip
     left_capacity, right_capacity = _capacities_nm(left, right, moments_nm, axle)

@@ -132,9 +132,8 @@ def step(
         vehicle,
     )
     demand = believed.power_demand_w
-    # A car that rolls back is to be stopped, whatever its wheels do.
-    slip_control = travel == m.direction or demand >= 0.0
-    made, after = drive(believed, before, slip_control, motion.lower_part, settings, vehicle, policy)
+    rolls_back = travel != m.direction and demand < 0.0
+    made, after = drive(believed, before, rolls_back, motion.lower_part, settings, vehicle, policy)
     e, f, g, h = after.wheels
     motor = made.motor_torque_nm
     friction = made.friction_torque_nm

@@ -94,7 +94,6 @@ def wheel_of(
     demand_w: float,
     gain: float,
     lower_part: float,
-    gate_mode: int,
     slip_target: float,
     least_nm: float,
     dt_s: float,
@@ -131,12 +130,12 @@ def wheel_of(
             road = 0.5 * (road + filtered(other_before.road_nm, other_taken, dt_s, settings.slip_filter_s))
     gated = False
     # The brakes have to be able to hold a car at rest: what is slip there, sensors cannot tell.
-    if gate_mode != GATE_MODE_OFF and not (braking and speed_mps < settings.slip_speed_floor_mps):
+    if settings.gate_mode != GATE_MODE_OFF and not (braking and speed_mps < settings.slip_speed_floor_mps):
         gated = axle_gated(
             gate_slip, demand_w, before.gated, settings.critical_slip, settings.gate_hysteresis, settings.gate_driving
         )
     grip = UNLIMITED_NM
-    if gate_mode == GATE_MODE_LIMITER:
+    if settings.gate_mode == GATE_MODE_LIMITER:
         grip = limiter_torque_nm(
             braking,
             road,

@@ -139,7 +139,7 @@ class Case(NamedTuple):
 
 def drive(m, before, s, car, table):
     """The law in the direction of travel, all sensors believed."""
-    return allocation.drive(m, before, True, 1.0, s, car, table)
+    return allocation.drive(m, before, False, 1.0, s, car, table)
 
 
 def take(m, before=None, s=DEFAULT, car=CAR):
@@ -1063,7 +1063,7 @@ def test_a_car_that_rolls_back_is_braked_by_both_axles_alike_whatever_the_split(
     assert torques == pytest.approx([torques[0]] * 4, rel=1e-6)
     assert torques[0] < 0.0
     ahead = after_a_second(direction)
-    assert ahead.front_share == pytest.approx(share), "where slip is controlled the split is the strategy's"
+    assert ahead.front_share == pytest.approx(share), "in the direction asked for the split is the strategy's"
 
 
 def test_reverse_drives_backwards_and_no_faster_than_it_may():
