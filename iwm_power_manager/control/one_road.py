@@ -17,46 +17,58 @@ from iwm_power_manager.model.chassis import GRAVITY_MPS2
 from iwm_power_manager.model.parameters import Axle, VehicleParams
 from iwm_power_manager.model.tyre import friction_coefficient
 
-#: Of two wheels on one road, the one that slips more has at least this part of the other one's grip: be it locked, and
-#: the centre of gravity a little elsewhere.
-LEAST_GRIP = 0.6
-#: Torques that are less than this part apart are of one road.
+#: Torques that are less than this part of the load apart are of one road: be the centre of gravity a little elsewhere.
 UNEQUAL_PART = 0.2
 #: A wheel tells how slippery its side is if it uses at least this part of what the one in question does.
 TELLING_PART = 0.5
 
 
 class _Taken(NamedTuple):
-    """What the road took from a wheel, as part of its load, at which slip, and whether it was gated; of their sizes."""
+    """What the road took from a wheel, as part of its load, at which slip, and whether it was gated; of their sizes.
+
+    `curve` is what its tyre has at that slip, where the road's peak is 1.
+    """
 
     slip: float
     used: float
     gated: bool
+    curve: float
 
 
 @kernel
 def _taken(before: WheelState, load_nm: float, axle: Axle) -> _Taken:
     """Of a wheel with its last command; a brake that gives nothing counts for no more than a road takes at the slip."""
     slip = abs(before.slip)
-    most = BEST_ROAD * friction_coefficient(slip, 1.0, axle.tyre)
-    return _Taken(slip, min(abs(before.road_nm) / load_nm, most), before.gated)
+    curve = friction_coefficient(slip, 1.0, axle.tyre)
+    return _Taken(slip, min(abs(before.road_nm) / load_nm, BEST_ROAD * curve), before.gated, curve)
+
+
+@kernel
+def _grip_part(own: _Taken, other: _Taken) -> float:
+    """Part of another wheel's grip that a wheel on the same road has at least.
+
+    The curve of a tyre is hollow towards the slip: half of the slip has more than half of the force. Beyond its peak it
+    falls.
+    """
+    if own.slip < other.slip:
+        return own.slip / other.slip
+    return min(own.curve / other.curve, 1.0) if other.curve > 0.0 else 1.0
 
 
 @kernel
 def _least_used(own: _Taken, other: _Taken, along: _Taken, across: _Taken) -> float:
     """What the road takes at least from a wheel; `other` is its axle's, `along` its side's, `across` the last.
 
-    The curve of a tyre is hollow towards the slip: half of the slip has more than half of the force. Where the wheel of
-    its side takes no less than the one across and slips no more, both sides run over one road.
+    Where the wheel of its side takes no less than the one across and slips no more, both sides run over one road.
     """
-    part = 1.0 if own.slip >= along.slip else own.slip / along.slip
-    # One that is gated for it comes back all the way: it would be given its torque again, and have it taken again.
-    least = (1.0 if own.gated else LEAST_GRIP) * part * along.used
     even = 1.0 - UNEQUAL_PART
+    # One that is gated for it comes back all the way: it would be given its torque again, and have it taken again.
+    margin = 1.0 if own.gated else even
+    least = margin * _grip_part(own, along) * along.used
     tells = along.used > TELLING_PART * own.used
     if tells and along.used >= even * across.used and even * along.slip <= across.slip:
-        steeper = max(other.slip / across.slip, 1.0) if across.slip > 0.0 else 1.0
-        least = max(least, (1.0 if own.gated else even) * min(other.used, across.used * steeper / LEAST_GRIP))
+        part = even * _grip_part(across, other)
+        least = max(least, margin * min(other.used, across.used / part if part > 0.0 else 0.0))
     return least
 
 

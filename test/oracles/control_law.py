@@ -67,7 +67,15 @@ def at_least(i, before, vehicle, near):
     ]
     beside, along, across = i ^ 1, i ^ 2, i ^ 3
     whole = before[i].gated
-    found = used[along] * (min(slips[i] / slips[along], 1.0) if slips[along] > 0.0 else 1.0) * (1.0 if whole else 0.6)
+
+    def part(one, two):
+        """Of the grip of `two`, what `one` has at least: on the way to the peak by its slip, beyond by its tyre."""
+        if slips[one] < slips[two]:
+            return slips[one] / slips[two]
+        own, other = (friction_coefficient(slips[k], 1.0, axles[k].tyre) for k in (one, two))
+        return 1.0 if own >= other else own / other
+
+    found = used[along] * part(i, along) * (1.0 if whole else 0.8)
     edges = (
         (used[along], 0.5 * used[i]),
         (used[along], 0.8 * used[across]),
@@ -75,8 +83,8 @@ def at_least(i, before, vehicle, near):
     )
     near |= {abs(x - y) <= 1e-9 * max(x, y) for x, y in edges}
     if used[along] > 0.5 * used[i] and all(x >= y for x, y in edges):
-        steeper = slips[beside] / slips[across] if 0.0 < slips[across] < slips[beside] else 1.0
-        found = max(found, min(used[beside], used[across] * steeper / 0.6) * (1.0 if whole else 0.8))
+        told = used[across] and used[across] / part(across, beside) / 0.8
+        found = max(found, min(used[beside], told) * (1.0 if whole else 0.8))
     return found * loads[i] * axles[i].wheel.radius_m
 
 

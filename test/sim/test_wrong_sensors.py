@@ -157,6 +157,7 @@ def test_a_wheel_that_shows_a_slip_it_does_not_have_takes_its_neighbours_no_brak
         (14.3, 61.7e3, wrong("wheel_front_right", "factor", 0.924, 0.3)),
         (7.8, 59.3e3, wrong("wheel_front_left", "offset", -1.662, 0.0)),
         (30.3, 55.9e3, wrong("wheel_front_left", "offset", -4.859, 0.0)),
+        (14.84, 64.057e3, wrong("wheel_rear_right", "factor", 0.882, 0.0)),
     ],
 )
 def test_a_wheel_that_shows_a_slip_it_does_not_have_takes_no_brakes_at_the_limit(speed_mps, power_w, broken):
