@@ -77,7 +77,7 @@ def drive(
     growth = speed_part(speed, s) * grip / GROWTH_FRICTION * s.yaw_rate_growth_nmps
     rate, lateral = measurement.yaw_rate_radps, measurement.lateral_mps2
     yaw = yaw_step(state.yaw, rate, lateral, speed, lasting_s, growth, braking, dt)
-    targets = slip_targets(front_s, braking, yaw.believed, s)
+    targets = slip_targets(front_s, braking, yaw.believed, measurement.motor_gain, before, s)
     front_alike = alike_wheels(0, measurement, before, targets)
     rear_alike = alike_wheels(2, measurement, before, targets)
 

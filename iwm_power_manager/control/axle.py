@@ -100,16 +100,25 @@ def unequal_s(before_s: float, left: Wheel, right: Wheel, wanted: bool, dt_s: fl
 
 
 @kernel
-def slip_targets(unequal_s: float, braking: bool, watched: bool, settings: Settings) -> Wheels:
+def slip_targets(
+    unequal_s: float, braking: bool, watched: bool, gain: Wheels, before: FourWheels, settings: Settings
+) -> Wheels:
     """Slip the limiter holds each wheel at.
 
     Unequal torques of the front wheels have to be steered against, with the front wheel that grips; and they turn the
     car, which the rear wheels keep straight: both need to keep something of their grip for that; less of it where the
-    yaw rate is `watched`.
+    yaw rate is `watched`. A motor that does not obey turns the car until it is found, and the driver swings back: rear
+    wheels that slip no more than the front ones keep it straight meanwhile.
     """
     most = settings.slip_target
-    if not braking or abs(unequal_s) <= UNEQUAL_S:
+    if not braking:
         return (most, most, most, most)
+    if abs(unequal_s) <= UNEQUAL_S:
+        behind = most
+        if min(gain[0], gain[1], gain[2], gain[3]) < 1.0:
+            front = -max(before[0].slip, before[1].slip)
+            behind = min(most, max(settings.unequal_rear_slip_target, front))
+        return (most, most, behind, behind)
     high = min(most, max(settings.unequal_slip_target, WATCHED_SLIP if watched else 0.0))
     low = min(most, settings.unequal_low_slip_target)
     rear = min(most, max(settings.unequal_rear_slip_target, WATCHED_REAR_SLIP if watched else 0.0))

@@ -112,7 +112,7 @@ class Case(NamedTuple):
 
     @property
     def slip_targets(self):
-        return oracle.slip_targets(self.before, self.settings, self.braking, self.after.yaw.believed)
+        return oracle.slip_targets(self.before, self.settings, self.braking, self.after.yaw.believed, self.m.motor_gain)
 
     def fast(self, i):
         return max(self.m.wheel_speed_radps[i], self.conversion(i))

@@ -176,14 +176,18 @@ def known_yaw(m, state, settings):
     return now
 
 
-def slip_targets(state, settings, braking, believed):
+def slip_targets(state, settings, braking, believed, gains):
     """Slip the limiter steers each wheel to: less while left and right are braked unequally.
 
-    Less of that where a yaw rate is believed.
+    Less of that where a yaw rate is believed. With a motor that is not whole, the rear slip no more than the front.
     """
     unequal = state.front_unequal_s
     if not braking or -0.03 <= unequal <= 0.03:
-        return [settings.slip_target] * 4
+        front = rear = settings.slip_target
+        if braking and any(gain < 1.0 for gain in gains):
+            least = min(-wheel.slip for wheel in state.wheels[:2])
+            rear = min(rear, max(least, settings.unequal_rear_slip_target))
+        return [front, front, rear, rear]
     high, rear = settings.unequal_slip_target, settings.unequal_rear_slip_target
     if believed:
         high, rear = max(high, 0.1), max(rear, 0.06)
@@ -300,7 +304,7 @@ def step(m, state, settings, vehicle, decide):
     braking = m.power_demand_w < 0.0
     bits = set()
     yaw = known_yaw(m, state, settings)
-    targets = slip_targets(state, settings, braking, yaw.believed)
+    targets = slip_targets(state, settings, braking, yaw.believed, m.motor_gain)
     standing = braking and m.speed_mps < settings.slip_speed_floor_mps
     wheels = [
         Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i], targets[i])
