@@ -10,11 +10,7 @@ sign wrong, does not show that. One that later shows the car turning off to the 
 No gyroscope is trusted alone: it takes an accelerometer that feels what the car does to the side, which is the change
 of its lateral speed and speed times yaw rate. The yaw rate counts within what is felt; and where what they differ by
 adds up to a lateral speed that no car has which still follows its wheels, neither is believed. Without a rate that is
-believed, what was added fades, no faster than what any driver follows grows; a car that by both turns towards the side
-with more grip is damped all the same.
-
-What is added grows only while it is used: a car whose wheels have all come to the side with more grip brakes alike left
-and right, and would be turned at once by what had grown meanwhile, when they come back.
+believed, what was added fades; a car that turns towards the side with more grip is damped all the same.
 """
 
 from __future__ import annotations
@@ -31,30 +27,24 @@ KNOWN_S = 0.25
 TURNED_RAD = 0.004
 TURNED_WITHIN_S = 1.0
 ASTRAY_RAD = -0.15
-#: Part of the speed, or of the one below, m/s, that yaw rate and accelerometer may add up to as lateral speed before
-#: they contradict each other; what is older than this, s, is forgotten: the car slips aside slowly, too.
-ASIDE_RAD = 0.035
-ASIDE_FROM_MPS = 20.0
+#: Lateral speed that yaw rate and accelerometer add up to, m/s, beyond which they contradict each other; what is older
+#: than this, s, is forgotten: the car slips aside slowly, too.
+ASIDE_MPS = 0.7
 ASIDE_S = 1.0
 #: What is felt towards the side with more grip may be camber, roll and noise up to this, m/s2; and up to this much less
 #: is felt than a car that begins to turn shows.
 FELT_MPS2 = 0.2
 NOT_YET_FELT_MPS2 = 1.0
-#: What is felt becomes a yaw rate by this speed, m/s, at least: brakes of wheels that steer are felt to the side, too.
-LEAST_MPS = 10.0
+#: What is felt becomes a yaw rate by this speed, m/s, at least.
+LEAST_MPS = 1.0
 #: The rate of a car that brakes unequally is no longer the same than this, s.
 SAME_S = 0.1
 #: Rate towards the side with more grip beyond which less is added than before, rad/s.
 CALM_RADPS = 0.03
 #: The budget is less by this for each rad/s, N m s: some six times what the tyres do against it at 25 m/s.
 DAMPING_NMS = 16000.0
-#: Where the rate is believed no more, what was added fades at this part of its growth: the driver steers against it.
-FADING_PART = 0.25
-#: The same while it is believed, but left and right brake alike.
-UNUSED_PART = 0.75
-#: Friction on which the growth is what it says: tyres hold a car against a moment by their stiffness across, which goes
-#: with it.
-GROWTH_FRICTION = 0.65
+#: The same where the rate is believed no more: one of both sensors is right, and the driver has a car to catch.
+LOST_DAMPING_NMS = 8000.0
 #: Most that is added in front; the rear wheels get this part of it, which leaves them what keeps the car straight.
 MOST_NM = 1500.0
 REAR_PART = 0.3
@@ -71,10 +61,9 @@ class YawState(NamedTuple):
     aside_mps : lateral speed of late, by accelerometer and yaw rate
     turned_rad : angle the car has turned since, towards the side with more grip
     believed : it has turned as unequal brakes turn it, and an accelerometer agrees
-    towards_radps : yaw rate towards the side with more grip, within what is felt; where it is lost, what both agree on
+    towards_radps : yaw rate towards the side with more grip, within what is felt
     extra_nm : what is added to the yaw budget
     lost : it was believed, and is no more
-    lasting_s : how long the front axle had braked unequally
     """
 
     straight_radps: float
@@ -88,13 +77,12 @@ class YawState(NamedTuple):
     towards_radps: float
     extra_nm: float
     lost: bool
-    lasting_s: float
 
 
 @kernel
 def no_yaw(extra_nm: float = 0.0) -> YawState:
     """Nothing is known of the yaw rate."""
-    return YawState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False, 0.0, extra_nm, False, 0.0)
+    return YawState(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False, 0.0, extra_nm, False)
 
 
 @kernel
@@ -119,8 +107,7 @@ def yaw_step(
     growth_nmps : of what is added; 0: the rate is not used
     """
     b, rate = before, yaw_rate_radps
-    fading = (FADING_PART if braking else 1.0) * growth_nmps
-    faded = max(b.extra_nm - fading * dt_s, 0.0) if unequal_s != 0.0 else 0.0
+    faded = max(b.extra_nm - growth_nmps * dt_s, 0.0) if unequal_s != 0.0 else 0.0
     change = lateral_mps2 - speed_mps * rate
     if math.isnan(change) or growth_nmps == 0.0:
         return no_yaw(faded)
@@ -128,7 +115,7 @@ def yaw_step(
         part = dt_s / (min(b.known_s, STRAIGHT_S) + dt_s)
         straight = b.straight_radps + part * (rate - b.straight_radps)
         level = b.level_mps2 + part * (change - b.level_mps2)
-        return YawState(straight, b.known_s + dt_s, rate, 0.0, level, 0.0, 0.0, False, 0.0, 0.0, False, 0.0)
+        return YawState(straight, b.known_s + dt_s, rate, 0.0, level, 0.0, 0.0, False, 0.0, 0.0, False)
     same = b.same_s + dt_s if rate == b.shown_radps else 0.0
     change -= b.level_mps2
     aside = (b.aside_mps + change * dt_s) / (1.0 + dt_s / ASIDE_S)
@@ -137,22 +124,16 @@ def yaw_step(
     turned = b.turned_rad + shown * dt_s
     apart = max(side * change - FELT_MPS2, 0.0) + min(side * change + NOT_YET_FELT_MPS2, 0.0)
     towards = shown + apart / max(speed_mps, LEAST_MPS)
-    most_aside = ASIDE_RAD * max(speed_mps, ASIDE_FROM_MPS)
-    agreed = same <= SAME_S and turned >= ASTRAY_RAD and abs(aside) <= most_aside
+    agreed = same <= SAME_S and turned >= ASTRAY_RAD and abs(aside) <= ASIDE_MPS
     known = b.known_s if agreed else 0.0
-    lasting = abs(unequal_s)
-    found = lasting <= TURNED_WITHIN_S and turned > TURNED_RAD
+    found = abs(unequal_s) <= TURNED_WITHIN_S and turned > TURNED_RAD
     believed = known >= KNOWN_S and (b.believed or found)
     lost = (b.believed or b.lost) and not believed
     extra = faded
-    if lost:
-        towards = min(shown, shown + side * change / max(speed_mps, LEAST_MPS))
     if believed and braking:
-        pace = 1.0 - max(towards, 0.0) / CALM_RADPS if lasting > b.lasting_s else -UNUSED_PART
+        pace = 1.0 - max(towards, 0.0) / CALM_RADPS
         extra = min(max(b.extra_nm + pace * growth_nmps * dt_s, 0.0), MOST_NM)
-    return YawState(
-        b.straight_radps, known, rate, same, b.level_mps2, aside, turned, believed, towards, extra, lost, lasting
-    )
+    return YawState(b.straight_radps, known, rate, same, b.level_mps2, aside, turned, believed, towards, extra, lost)
 
 
 @kernel
@@ -160,7 +141,8 @@ def with_yaw(
     front_nm: tuple[float, float], rear_nm: tuple[float, float], unequal_s: float, yaw: YawState
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Yaw moments that more torque left, and more torque right, may have, with what the yaw rate adds or takes."""
-    damped = DAMPING_NMS * max(yaw.towards_radps, 0.0) if yaw.believed or yaw.lost else 0.0
+    damping = DAMPING_NMS if yaw.believed else LOST_DAMPING_NMS if yaw.lost else 0.0
+    damped = damping * max(yaw.towards_radps, 0.0)
     rear = REAR_PART * max(yaw.extra_nm - damped, 0.0)
     front = yaw.extra_nm - damped
     if unequal_s > 0.0:

@@ -277,7 +277,6 @@ YAWS = st.builds(
     towards_radps=RATES,
     extra_nm=st.sampled_from((400.0, 1.0, MOST_NM, 0.0)),
     lost=st.booleans(),
-    lasting_s=st.sampled_from((0.0, 0.04, 0.99, 3.0)),
 )
 WATCHED = st.builds(
     lambda state, unequal_s, yaw: state._replace(front_unequal_s=unequal_s, yaw=yaw),

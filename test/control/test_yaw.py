@@ -8,16 +8,11 @@ import math
 import pytest
 
 from iwm_power_manager.control.yaw import (
-    ASIDE_FROM_MPS,
-    ASIDE_RAD,
+    ASIDE_MPS,
     CALM_RADPS,
-    DAMPING_NMS,
-    FADING_PART,
     FELT_MPS2,
-    LEAST_MPS,
     MOST_NM,
     NOT_YET_FELT_MPS2,
-    UNUSED_PART,
     no_yaw,
     with_yaw,
     yaw_step,
@@ -116,7 +111,7 @@ def test_what_was_added_fades_where_the_sensor_fails_during_the_braking(rates):
     lost = next(k for k, state in enumerate(states) if not state.believed)
     assert lost * DT <= 0.55
     for before, after in zip(states[lost - 1 :], states[lost:], strict=False):
-        assert after.extra_nm == pytest.approx(max(before.extra_nm - FADING_PART * GROWTH * DT, 0.0))
+        assert after.extra_nm == pytest.approx(max(before.extra_nm - GROWTH * DT, 0.0))
     again = braked(states[-1], turning(), since_s=2.5)
     assert not again.believed
 
@@ -157,35 +152,28 @@ def test_the_yaw_rate_counts_within_what_is_felt(side):
 
 
 def test_at_walking_pace_what_is_felt_is_no_large_yaw_rate():
-    slow = yaw_step(believed(), 0.001, FELT_MPS2 + 0.2, 0.1, 1.0, GROWTH, True, DT)
-    assert slow.towards_radps == pytest.approx(0.001 + 0.2 / LEAST_MPS, abs=0.001)
+    slow = yaw_step(believed(), 0.001, FELT_MPS2 + 0.02, 0.1, 1.0, GROWTH, True, DT)
+    assert slow.towards_radps == pytest.approx(0.001 + 0.02, abs=0.001)
 
 
 @SIDES
 @pytest.mark.parametrize("off", [0.08, -0.08, 0.4, -0.4])
 def test_where_both_contradict_each_other_neither_is_believed(side, off):
-    true = turning(6.0)
+    true = turning(3.0)
     shown = [rate + off for rate in true]
     states = [believed(side)]
     for k, (rate, real) in enumerate(zip(shown, true, strict=True)):
         states.append(braked(states[-1], [rate], side, since_s=1.0 + k * DT, true=[real]))
     lost = next(k for k, state in enumerate(states) if not state.believed)
-    apart_s = ASIDE_RAD / abs(off)
+    apart_s = ASIDE_MPS / SPEED / abs(off)
     assert apart_s <= lost * DT <= 1.4 * apart_s + DT
     assert states[-1].extra_nm == 0.0
-    assert not braked(states[-1], turning(), side, since_s=8.0).believed, "not in this braking any more"
+    assert not braked(states[-1], turning(), side, since_s=5.0).believed, "not in this braking any more"
 
 
 def test_a_car_that_slowly_slips_aside_is_believed():
     true = [0.001 + 1e-6 * k for k in range(300)]
-    assert braked(believed(), true, since_s=1.0, slipping=0.7 * ASIDE_RAD * SPEED).believed
-
-
-@pytest.mark.parametrize(("speed", "most"), [(35.0, ASIDE_RAD * 35.0), (10.0, ASIDE_RAD * ASIDE_FROM_MPS)])
-def test_the_faster_the_car_the_faster_it_may_slip_aside(speed, most):
-    for part, still in ((0.98, True), (1.02, False)):
-        aside = believed()._replace(aside_mps=part * most * (1.0 + DT))
-        assert yaw_step(aside, 0.0, 0.0, speed, 1.0, GROWTH, True, DT).believed is still
+    assert braked(believed(), true, since_s=1.0, slipping=0.7 * ASIDE_MPS).believed
 
 
 @pytest.mark.parametrize(("rate", "felt"), [(0.0, math.nan), (math.nan, 0.0)], ids=["gyroscope", "accelerometer"])
@@ -193,7 +181,7 @@ def test_one_of_both_alone_adds_nothing(rate, felt):
     yaw = believed()
     for since in (1.0, 1.01):
         yaw = yaw_step(yaw, rate, felt, SPEED, since, GROWTH, True, DT)
-    assert yaw == no_yaw(believed().extra_nm - 2 * FADING_PART * GROWTH * DT)
+    assert yaw == no_yaw(believed().extra_nm - 2 * GROWTH * DT)
 
 
 def test_without_growth_the_rate_is_not_used():
@@ -213,25 +201,7 @@ def test_where_the_rate_is_lost_a_car_that_turns_is_still_braked_less_unequally(
         with_yaw((900.0, 900.0), (0.0, 0.0), side, lost._replace(towards_radps=x, extra_nm=0.0))[0]
         for x in (-0.1, 0.0, 0.05)
     ]
-    assert [budget[own] for budget in budgets] == pytest.approx([900.0, 900.0, 900.0 - 0.05 * DAMPING_NMS])
+    assert [budget[own] for budget in budgets] == pytest.approx([900.0, 900.0, 500.0])
     assert {budget[1 - own] for budget in budgets} == {900.0}
     never = no_yaw()._replace(towards_radps=0.05)
     assert with_yaw((900.0, 900.0), (0.0, 0.0), side, never) == ((900.0, 900.0), (0.0, 0.0))
-
-
-@SIDES
-@pytest.mark.parametrize("felt", [1.0, -1.0, 0.0], ids=["right", "wrong sign", "stuck"])
-def test_where_the_rate_is_lost_only_what_both_sensors_show_is_damped(side, felt):
-    lost = believed(side)._replace(aside_mps=10.0)
-    for turn in (0.1, -0.1):
-        yaw = yaw_step(lost, side * turn, side * felt * SPEED * turn, SPEED, side, GROWTH, True, DT)
-        assert yaw.lost
-        assert yaw.towards_radps == pytest.approx(min(turn, felt * turn), abs=1e-6)
-
-
-@SIDES
-def test_what_is_added_grows_only_while_left_and_right_brake_unequally(side):
-    yaw = believed(side)
-    again = yaw_step(yaw, side * 0.002, side * SPEED * 0.002, SPEED, side * (yaw.lasting_s - DT), GROWTH, True, DT)
-    assert again.believed
-    assert again.extra_nm == pytest.approx(yaw.extra_nm - UNUSED_PART * GROWTH * DT)

@@ -119,8 +119,7 @@ def known_yaw(m, state, settings):
     """What is remembered of the yaw rate: what it was before, whether it is believed, and what it adds."""
     was, unequal, rate, dt = state.yaw, state.front_unequal_s, m.yaw_rate_radps, m.dt_s
     slipping = m.lateral_mps2 - max(m.speed_mps, 0.0) * rate
-    firm = max(side.friction for side in (state.friction.left, state.friction.right))
-    growth = settings.yaw_rate_growth_nmps * yaw_speed_factor(m.speed_mps, settings) * firm / 0.65
+    growth = settings.yaw_rate_growth_nmps * yaw_speed_factor(m.speed_mps, settings)
     alike = -0.03 <= unequal <= 0.03
     unknown = was._replace(
         straight_radps=0.0,
@@ -132,9 +131,8 @@ def known_yaw(m, state, settings):
         turned_rad=0.0,
         believed=False,
         towards_radps=0.0,
-        lasting_s=0.0,
     )
-    faded = 0.0 if alike else max(0.0, was.extra_nm - dt * growth / (4.0 if m.power_demand_w < 0.0 else 1.0))
+    faded = 0.0 if alike else max(0.0, was.extra_nm - dt * growth)
     unknown = unknown._replace(lost=False)
     if slipping != slipping or growth == 0.0:
         return unknown._replace(extra_nm=faded)
@@ -150,8 +148,7 @@ def known_yaw(m, state, settings):
     to_left = rate - was.straight_radps
     turning = to_left if unequal > 0.0 else -to_left
     felt = slipping if unequal > 0.0 else -slipping
-    by_speed = max(m.speed_mps, 10.0)
-    towards = turning + (felt - min(max(felt, -1.0), 0.2)) / by_speed
+    towards = turning + (felt - min(max(felt, -1.0), 0.2)) / max(m.speed_mps, 1.0)
     now = was._replace(
         shown_radps=rate,
         same_s=was.same_s + dt if rate == was.shown_radps else 0.0,
@@ -159,19 +156,14 @@ def known_yaw(m, state, settings):
         turned_rad=was.turned_rad + dt * turning,
         towards_radps=towards,
         extra_nm=faded,
-        lasting_s=abs(unequal),
     )
-    if now.same_s > 0.1 or now.turned_rad < -0.15 or abs(now.aside_mps) > 0.035 * max(m.speed_mps, 20.0):
+    if now.same_s > 0.1 or now.turned_rad < -0.15 or not -0.7 <= now.aside_mps <= 0.7:
         now = now._replace(known_s=0.0)
     turned_at_first = -1.0 <= unequal <= 1.0 and now.turned_rad > 0.004
     now = now._replace(believed=now.known_s >= 0.25 and (was.believed or turned_at_first))
     now = now._replace(lost=not now.believed and (was.lost or was.believed))
-    if now.lost:
-        now = now._replace(towards_radps=turning + min(0.0, felt / by_speed))
     if now.believed and m.power_demand_w < 0.0:
         calm = (0.03 - towards) / 0.03 if towards > 0.0 else 1.0
-        if abs(unequal) <= was.lasting_s:
-            calm = -0.75
         now = now._replace(extra_nm=min(1500.0, max(0.0, was.extra_nm + dt * growth * calm)))
     return now
 
@@ -203,7 +195,9 @@ def yaw_budget(name, state, settings, speed, braking, yaw):
         return [most, most]
     factor = yaw_speed_factor(speed, settings)
     unequal, lasting = getattr(state, f"{name}_unequal_s"), state.front_unequal_s
-    damping = 16000.0 if yaw.believed or yaw.lost else 0.0
+    damping = 16000.0 if yaw.believed else 0.0
+    if yaw.lost and not yaw.believed:
+        damping = 8000.0
     added = yaw.extra_nm - damping * max(yaw.towards_radps, 0.0)
     if name == "rear":
         added = 0.3 * max(added, 0.0)
