@@ -165,8 +165,8 @@ def split_outcome_w(
         rear += 2.0 * idle_drag_nm(0.0, axles.front_radps, front_motor) / vehicle.front.wheel.radius_m
     elif rear == 0.0 and sign * front <= axles.front_capacity_n:
         front += 2.0 * idle_drag_nm(0.0, axles.rear_radps, rear_motor) / vehicle.rear.wheel.radius_m
-    need_front = max(sign * front, 0.0)
-    need_rear = max(sign * rear, 0.0)
+    need_front = sign * front
+    need_rear = sign * rear
 
     over = max(need_front - axles.front_grip_n, 0.0) + max(need_rear - axles.rear_grip_n, 0.0)
     given_front = min(need_front, axles.front_capacity_n)

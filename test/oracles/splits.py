@@ -39,7 +39,7 @@ def split_w(force, speed, share, friction, slip_aware, vehicle):
         if motor.idle_drive == 1 and direction * asked[1 - idle] <= room[1 - idle]:
             drag = motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * rolling[idle]
             asked[1 - idle] += 2.0 * drag / axles[idle].wheel.radius_m
-    asked = [max(direction * x, 0.0) for x in asked]
+    asked = [direction * x for x in asked]
     given = [min(a, r) for a, r in zip(asked, room, strict=True)]
     for axle in (1, 0):
         short = sum(asked) - sum(given)
