@@ -13,7 +13,8 @@ middle would not fit, is not offered: so no minute sees more than the budget and
 budgets and the first bucket, whatever is driven, and nothing can hold the split at a share that has become wrong.
 
 The price of a change is the multiplier of the constrained problem. A constant one is optimal: it is the solver's, while
-the buckets are empty, and little more until one of them is nearly full (docs/solver.md).
+the buckets are empty, and little more until one of them is nearly full (docs/solver.md). Where another change would not
+fit, it has risen beyond all bounds: what is left goes to the changes that are worth most, not to those that come first.
 """
 
 from __future__ import annotations
@@ -36,9 +37,9 @@ _LEAST = 2.0
 
 #: What a price that is higher by one in the logarithm takes from the changes, as a part of the budget.
 ELASTICITY = 0.35
-#: Price at a full second bucket, which is free to its half. At a full first one it is 2, beside what its end asks for.
-HURRIED = math.exp(2.0)
-_FULL = 0.99
+#: A change and the way back to the middle: with less room than that, a share that is left for another is not offered.
+THERE_AND_BACK = 2.0
+_FULL = 0.999
 _ROUNDING = 1e-9
 
 
@@ -101,15 +102,22 @@ def affordable(share: float, previous: float, used: Used, changes_per_min: float
 
 
 @kernel
+def _rising(used: float, size: float) -> tuple[float, float]:
+    """Level of a bucket, 0..1, and how many times dearer a change is for it: beyond all bounds where none fits in."""
+    holds = max(size - THERE_AND_BACK, 1.0)
+    level = min(used / holds, _FULL)
+    return level, 1.0 + 0.5 * math.pi / (ELASTICITY * holds) * math.tan(0.5 * math.pi * level)
+
+
+@kernel
 def price_factor(used: Used, changes_per_min: float) -> float:
     """How many times the solver's price a change costs."""
     if changes_per_min <= 0.0:
         return 1.0
     size = buckets(changes_per_min)
-    level = min(used.lasting / size.lasting, _FULL)
-    steep = 0.5 * math.pi / (ELASTICITY * size.lasting)
-    hurry = max(2.0 * min(used.minute / size.minute, 1.0) - 1.0, 0.0)
-    return math.exp2(level) * HURRIED**hurry * (1.0 + steep * math.tan(0.5 * math.pi * level))
+    level, lasting = _rising(used.lasting, size.lasting)
+    _, minute = _rising(used.minute, size.minute)
+    return math.exp2(level) * lasting * minute
 
 
 @kernel

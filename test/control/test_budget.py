@@ -62,13 +62,30 @@ USED = st.builds(budget.Used, st.floats(0.0, 600.0), st.floats(0.0, 200.0))
 @given(USED, USED, RATE)
 def test_the_price_never_falls_with_what_is_used(one, other, rate):
     both = budget.Used(max(one.lasting, other.lasting), max(one.minute, other.minute))
-    assert 1.0 <= budget.price_factor(one, rate) <= budget.price_factor(both, rate) < 1e4
+    assert 1.0 <= budget.price_factor(one, rate) <= budget.price_factor(both, rate) < 1e8
     assert budget.price_factor(budget.Used(0.0, 0.0), rate) == 1.0
 
 
-def test_a_second_bucket_costs_nothing_until_it_is_half_full():
-    prices = [budget.price_factor(budget.Used(0.0, minute), 8.0) for minute in (0.0, 5.0, 7.5, 10.0)]
-    assert prices == pytest.approx([1.0, 1.0, np.exp(1.0), np.exp(2.0)])
+@given(st.floats(0.0, 1.5), st.floats(2.5, 100.0))
+def test_where_no_change_fits_the_price_has_risen_beyond_what_one_is_worth(more, rate):
+    """What comes first never gets the room that something of ten times its worth would have needed."""
+    size = budget.buckets(rate)
+    for used in (budget.Used(size.lasting - 2.0 + more, 0.0), budget.Used(0.0, size.minute - 2.0 + more)):
+        assert budget.price_factor(used, rate) > 10.0
+        assert more < 1e-6 or not budget.affordable(1.0, 0.5, used, rate)
+
+
+@pytest.mark.parametrize("rate", [1.0, 8.0, 30.0])
+def test_a_bucket_costs_what_the_solution_of_its_hamilton_jacobi_bellman_equation_says(rate):
+    """w' = e w^2 + c from nothing at the empty bucket to no bound where a change and the way back fill it."""
+    size = budget.buckets(rate)
+    for bucket, other in (("minute", 0.0), ("lasting", 1.0)):
+        holds = max(getattr(size, bucket) - 2.0, 1.0)
+        steep = np.pi / (2.0 * holds * budget.ELASTICITY)
+        for level in (0.0, 0.25, 0.5, 0.75, 0.9):
+            used = budget.Used(0.0, 0.0)._replace(**{bucket: level * holds})
+            expected = (1.0 + steep * np.tan(0.5 * np.pi * level)) * 2.0 ** (level * other)
+            assert budget.price_factor(used, rate) == pytest.approx(expected)
 
 
 def test_between_the_tabulated_prices_the_logarithm_counts_and_beyond_them_the_last():
