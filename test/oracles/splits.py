@@ -144,10 +144,12 @@ def bellman(point, previous, table, outcome, used=(0.0, 0.0), steps=1.0, motors_
             powers += [] if earlier_w is None else [earlier_w]
             steps += 0.5 * (0.8 / table.problem.dt_s - 1.0)
         full = (max(5.0 * budget, 2.0), max(1.25 * budget, 2.0))
-        lasting, minute = (min(of / size, 1.0) for of, size in zip(used, full, strict=True))
-        angle = math.pi / 2.0 * min(lasting, 0.99)
-        factor = 2.0 ** min(lasting, 0.99) * (1.0 + math.pi / (0.7 * full[0]) * math.tan(angle))
-        factor *= math.exp(max(4.0 * minute - 2.0, 0.0))
+        # Both are full where a change and the way back have no room.
+        holds = [max(size - 2.0, 1.0) for size in full]
+        levels = [min(of / size, 0.999) for of, size in zip(used, holds, strict=True)]
+        factor = 2.0 ** levels[0]
+        for level, size in zip(levels, holds, strict=True):
+            factor *= 1.0 + math.pi / (0.7 * size) * math.tan(math.pi / 2.0 * level)
         level = min(math.log(factor, 3.0), 2.0)
     costs, wholes = {}, {}
     for share in (previous, *table.share):
