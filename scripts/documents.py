@@ -23,7 +23,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from iwm_power_manager.control.budget import ELASTICITY, buckets
+from iwm_power_manager.control.budget import ELASTICITY, THERE_AND_BACK, buckets
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
@@ -162,7 +162,7 @@ def trials(_: Study) -> str:
     policy = load_policy(share_path("policies/jalalmaab_2015_drag_coupled_mu090.npz"))
     tried = "".join(f"{trial.price_j:.4g}: {trial.changes_per_min:<8.3g}" for trial in policy.trials)
     problem = policy.problem
-    spread = ELASTICITY * buckets(problem.changes_per_min).lasting ** 2
+    spread = ELASTICITY * (buckets(problem.changes_per_min).lasting - THERE_AND_BACK) ** 2
     loss_j = problem.changes_per_min * problem.switching_cost_j * math.pi**2 / (8.0 * spread)
     return (
         f"Of the shipped policy (idle drive drag, friction {policy.friction:g}, {policy.identity}; all trials are in "
