@@ -105,18 +105,22 @@ def affordable(share: float, previous: float, used: Used, changes_per_min: float
 def _rising(used: float, size: float) -> tuple[float, float]:
     """Level of a bucket, 0..1, and how many times dearer a change is for it: beyond all bounds where none fits in."""
     holds = max(size - THERE_AND_BACK, 1.0)
-    level = min(used / holds, _FULL)
+    level = min(max(used, 0.0) / holds, _FULL)
     return level, 1.0 + 0.5 * math.pi / (ELASTICITY * holds) * math.tan(0.5 * math.pi * level)
 
 
 @kernel
-def price_factor(used: Used, changes_per_min: float) -> float:
-    """How many times the solver's price a change costs."""
+def price_factor(used: Used, previous: float, changes_per_min: float) -> float:
+    """How many times the solver's price a change costs, away from the share that is held.
+
+    Whoever is away from the middle has the way back set aside: it costs what the way there did.
+    """
     if changes_per_min <= 0.0:
         return 1.0
     size = buckets(changes_per_min)
-    level, lasting = _rising(used.lasting, size.lasting)
-    _, minute = _rising(used.minute, size.minute)
+    away = changes_counted(0.5 - previous)
+    level, lasting = _rising(used.lasting - away, size.lasting)
+    _, minute = _rising(used.minute - away, size.minute)
     return math.exp2(level) * lasting * minute
 
 

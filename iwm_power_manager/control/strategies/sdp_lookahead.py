@@ -154,7 +154,7 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
     """Share that minimises eq. 31, as far as it is believed, among those whose change the budget can afford."""
     previous = situation.previous_share
     used = situation.changes_used
-    factor = price_factor(used, policy.changes_per_min)
+    factor = price_factor(used, previous, policy.changes_per_min)
     level = price_level(factor) if policy.dearer_cost_j.shape[0] > 0 else 0.0
     price = factor * policy.switching_cost_j
     budgeted = policy.changes_per_min > 0.0
