@@ -59,11 +59,11 @@ def test_a_minute_may_have_18_changes_beyond_a_budget_of_8():
 USED = st.builds(budget.Used, st.floats(0.0, 600.0), st.floats(0.0, 200.0))
 
 
-@given(USED, USED, RATE)
-def test_the_price_never_falls_with_what_is_used(one, other, rate):
+@given(USED, USED, SHARE, RATE)
+def test_the_price_never_falls_with_what_is_used(one, other, share, rate):
     both = budget.Used(max(one.lasting, other.lasting), max(one.minute, other.minute))
-    assert 1.0 <= budget.price_factor(one, rate) <= budget.price_factor(both, rate) < 1e8
-    assert budget.price_factor(budget.Used(0.0, 0.0), rate) == 1.0
+    assert 1.0 <= budget.price_factor(one, share, rate) <= budget.price_factor(both, share, rate) < 1e8
+    assert budget.price_factor(budget.Used(0.0, 0.0), share, rate) == 1.0
 
 
 @given(st.floats(0.0, 1.5), st.floats(2.5, 100.0))
@@ -71,8 +71,15 @@ def test_where_no_change_fits_the_price_has_risen_beyond_what_one_is_worth(more,
     """What comes first never gets the room that something of ten times its worth would have needed."""
     size = budget.buckets(rate)
     for used in (budget.Used(size.lasting - 2.0 + more, 0.0), budget.Used(0.0, size.minute - 2.0 + more)):
-        assert budget.price_factor(used, rate) > 10.0
+        assert budget.price_factor(used, 0.5, rate) > 10.0
         assert more < 1e-6 or not budget.affordable(1.0, 0.5, used, rate)
+
+
+@given(USED, SHARE, RATE)
+def test_the_way_back_to_the_middle_costs_what_the_way_there_did(used, share, rate):
+    """A share whose room for the return is set aside is never held because a bucket is full."""
+    there = budget.spent(used, share - 0.5)
+    assert budget.price_factor(there, share, rate) == pytest.approx(budget.price_factor(used, 0.5, rate), rel=1e-6)
 
 
 @pytest.mark.parametrize("rate", [1.0, 8.0, 30.0])
@@ -85,7 +92,7 @@ def test_a_bucket_costs_what_the_solution_of_its_hamilton_jacobi_bellman_equatio
         for level in (0.0, 0.25, 0.5, 0.75, 0.9):
             used = budget.Used(0.0, 0.0)._replace(**{bucket: level * holds})
             expected = (1.0 + steep * np.tan(0.5 * np.pi * level)) * 2.0 ** (level * other)
-            assert budget.price_factor(used, rate) == pytest.approx(expected)
+            assert budget.price_factor(used, 0.5, rate) == pytest.approx(expected)
 
 
 def test_between_the_tabulated_prices_the_logarithm_counts_and_beyond_them_the_last():
@@ -96,4 +103,4 @@ def test_between_the_tabulated_prices_the_logarithm_counts_and_beyond_them_the_l
 
 def test_without_a_budget_nothing_is_counted():
     assert budget.affordable(1.0, 0.0, budget.Used(1e9, 1e9), 0.0)
-    assert budget.price_factor(budget.Used(1e9, 1e9), 0.0) == 1.0
+    assert budget.price_factor(budget.Used(1e9, 1e9), 0.5, 0.0) == 1.0

@@ -365,8 +365,8 @@ def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_
     )._replace(switching_fixed_cost_j=0.0)
 
     def moves(price, used):
-        """Whether the share leaves 0.6, at 3 kW and 12 m/s, where one axle alone is best."""
-        return lookahead_share(3000.0, 12.0, 0.0, 0.0, 0.6, used, CAR, table._replace(switching_cost_j=price)) != 0.6
+        """Whether the share leaves 0.5, at 0.3 kW and 12 m/s, where one axle alone is best."""
+        return lookahead_share(300.0, 12.0, 0.0, 0.0, 0.5, used, CAR, table._replace(switching_cost_j=price)) != 0.5
 
     prices = np.geomspace(1e-3, 1e4, 400)
 

@@ -146,7 +146,9 @@ def bellman(point, previous, table, outcome, used=(0.0, 0.0), steps=1.0, motors_
         full = (max(5.0 * budget, 2.0), max(1.25 * budget, 2.0))
         # Both are full where a change and the way back have no room.
         holds = [max(size - 2.0, 1.0) for size in full]
-        levels = [min(of / size, 0.999) for of, size in zip(used, holds, strict=True)]
+        # The way back is set aside, and costs what the way there did.
+        away = min(abs(0.5 - previous) / 0.25, 1.0)
+        levels = [min(max(of - away, 0.0) / size, 0.999) for of, size in zip(used, holds, strict=True)]
         factor = 2.0 ** levels[0]
         for level, size in zip(levels, holds, strict=True):
             factor *= 1.0 + math.pi / (0.7 * size) * math.tan(math.pi / 2.0 * level)
