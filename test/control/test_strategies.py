@@ -385,6 +385,22 @@ def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_
     assert free / minute[1] == pytest.approx(1.0 + np.pi / (0.7 * 8.0), rel=0.05)
 
 
+def test_the_way_back_to_the_middle_gets_dearer_by_what_was_used_before_the_way_there():
+    table = BUDGETED._replace(
+        expected_cost_j=BUDGETED.expected_cost_j * 0.0, dearer_cost_j=BUDGETED.dearer_cost_j * 0.0, discount=0.0
+    )._replace(switching_fixed_cost_j=0.0)
+
+    def dearest(minute):
+        """Price up to which the share leaves 1.0 at 12 kW and 12 m/s, where both axles together are best."""
+        prices = np.geomspace(1e-2, 1e4, 800)
+        state = (12e3, 12.0, 0.0, 0.0, 1.0, (0.0, minute), CAR)
+        return max(
+            (p for p in prices if lookahead_share(*state, table._replace(switching_cost_j=p)) != 1.0), default=0.0
+        )
+
+    assert dearest(1.0) / dearest(5.0) == pytest.approx(1.0 + np.pi / (0.7 * 8.0), rel=0.05)
+
+
 def test_no_load_is_moved_off_an_axle_for_slip_that_a_jitter_does_not_reach():
     shares = np.linspace(0.0, 1.0, 21)
     free = empty_table(shares)._replace(discount=0.0, problem=TABLE.problem._replace(friction=0.2))

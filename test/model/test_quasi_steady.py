@@ -102,6 +102,20 @@ def test_a_split_costs_what_its_axles_cost_and_what_nobody_can_give_is_said(
     assert missing >= -1e-9
 
 
+@pytest.mark.parametrize("share", [0.0, 1.0])
+@pytest.mark.parametrize("car", [CAR, UNEVEN], ids=["the paper's", "axles unlike"])
+def test_braking_with_less_than_an_idle_axle_drags_the_working_one_drives(car, share):
+    idle = car.rear if share == 1.0 else car.front
+    motor, radius = idle.motor, idle.wheel.radius_m
+    drag_n = 2.0 * (motor.idle_drag_constant_nm + motor.idle_drag_linear_nm_per_radps * 15.0 / radius) / radius
+    powers = [split_power_w(part * drag_n, 15.0, share, 0.9, True, car)[0] for part in (-0.1, -0.5, -0.9)]
+    assert powers == pytest.approx(
+        [split_w(part * drag_n, 15.0, share, 0.9, True, car)[0] for part in (-0.1, -0.5, -0.9)]
+    )
+    # Each newton less of braking is one more to drive with: at least its own power.
+    assert powers[0] - powers[1] > 0.4 * drag_n * 15.0 < powers[1] - powers[2]
+
+
 def test_slip_costs_power():
     aware, _ = split_power_w(700.0, 15.0, 0.5, 0.2, True, CAR)
     blind, _ = split_power_w(700.0, 15.0, 0.5, 0.2, False, CAR)
