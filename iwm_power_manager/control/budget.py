@@ -29,16 +29,16 @@ WHOLE_CHANGE = 0.25
 #: Prices of a change at which the solver tabulates the cost-to-go beside its own, as multiples of it.
 DEARER = (3.0, 9.0)
 
+#: A change and the way back to the middle, in changes: with less room a share that is left for another is not offered.
+THERE_AND_BACK = 2.0
 #: The first bucket holds this many minutes' budget; both hold at least one change and the way back.
 LASTING_MIN = 5.0
 #: The second one holds this many, and leaks at this many times the budget.
 MINUTE_MIN, MINUTE_LEAK = 1.25, 2.0
-_LEAST = 2.0
 
 #: What a price that is higher by one in the logarithm takes from the changes, as a part of the budget.
 ELASTICITY = 0.35
-#: A change and the way back to the middle: with less room than that, a share that is left for another is not offered.
-THERE_AND_BACK = 2.0
+#: Level at which a bucket counts as full, so that the price stays a number.
 _FULL = 0.999
 _ROUNDING = 1e-9
 
@@ -67,7 +67,7 @@ class Used(NamedTuple):
 @kernel
 def buckets(changes_per_min: float) -> Used:
     """Changes the buckets hold."""
-    return Used(max(LASTING_MIN * changes_per_min, _LEAST), max(MINUTE_MIN * changes_per_min, _LEAST))
+    return Used(max(LASTING_MIN * changes_per_min, THERE_AND_BACK), max(MINUTE_MIN * changes_per_min, THERE_AND_BACK))
 
 
 @kernel
