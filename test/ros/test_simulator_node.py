@@ -69,12 +69,14 @@ class StandIn(Member):
         self.motors = self.node.create_publisher(m.JointState, m.WHEEL_TORQUE_COMMAND, profile)
         self.brakes = self.node.create_publisher(m.JointState, m.FRICTION_BRAKE_COMMAND, profile)
         self.received: dict[str, list[Any]] = {}
-        self.unanswered: list[float] = []
+        self.answered = 0
+        self.lockstep = lockstep
         everything = qos.profile(lockstep=True)
         for topic, kind in m.TOPIC_TYPES.items():
             name = f"{self.namespace}/clock" if topic == m.CLOCK else topic
             self.received[topic] = []
             self.node.create_subscription(kind, name, self._keeper(topic), everything)
+        self.node.create_timer(0.05, self._serve)
         self.answer: Callable[[int, float, float], None] = self.obey
         values = {"result_file": self.result, "lockstep": lockstep, "answer_timeout_s": 90.0, **parameters}
         # A busy machine may keep this process waiting; a set is sent twice only where a test is about that.
@@ -85,14 +87,24 @@ class StandIn(Member):
     def _keeper(self, topic: str) -> Callable[[Any], None]:
         def keep(message: Any) -> None:
             self.received[topic].append(message)
-            if topic == m.POWER_DEMAND:
-                self.unanswered.append(message.data)
-            # Topics are not ordered among each other: the first demand may come before the first speed.
-            while self.unanswered and self.received[m.VEHICLE_SPEED]:
-                speed = readings.vehicle_speed(self.received[m.VEHICLE_SPEED][-1])
-                self.answer(speed.stamp_ns, speed.speed_mps, self.unanswered.pop(0))
+            self._serve()
 
         return keep
+
+    def _serve(self) -> None:
+        """Answer each demand whose set's speed is here too: topics are not ordered among each other.
+
+        The simulator counts publishers, so it may drive before these have found its subscriptions.
+        """
+        demands, speeds = self.received[m.POWER_DEMAND], self.received[m.VEHICLE_SPEED]
+        while self.answered < min(len(demands), len(speeds)) and all(
+            publisher.get_subscription_count() for publisher in (self.motors, self.brakes)
+        ):
+            # Only in lock-step does every message arrive.
+            speed = readings.vehicle_speed(speeds[self.answered if self.lockstep else -1])
+            demand = demands[self.answered]
+            self.answered += 1
+            self.answer(speed.stamp_ns, speed.speed_mps, demand.data)
 
     def obey(self, stamp_ns: int, speed_mps: float, power_w: float) -> None:
         """Equal torque on all wheels, motors driving and brakes braking."""
