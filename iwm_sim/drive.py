@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -108,7 +108,7 @@ class Drive:
         self._substeps = substeps
         self._series = np.full((steps, len(COLUMNS)), np.nan)
         self._road_series = np.full((steps, len(ROAD_COLUMNS)), np.nan)
-        self._faults = Faults(scenario.faults)
+        self._faults = Faults(scenario.faults, dt_s)
         self._hands = LaneKeeper(self._believed, dt_s) if scenario.steering is None else None
         self.car = plant.initial_plant(self._params, scenario.soc, scenario.speed_mps)
         self._driver = DriverState(0.0)
@@ -172,9 +172,15 @@ class Drive:
         a, b, c, d = values
         return a, b, c, d
 
-    def lost(self, message: str) -> bool:
-        """Whether a message, by the name of its topic, does not arrive in this step."""
-        return self._faults.lost(message, self.time_s)
+    def arriving(self, message: str, sensors: Sensors, now_ns: int) -> Iterable[tuple[int, Sensors]]:
+        """What arrives of a message, by the name of its topic, in this step, oldest first, each with its stamp.
+
+        Parameters
+        ----------
+        sensors : what is shown now
+        now_ns : the time, as stamps are written
+        """
+        return self._faults.arriving(message, sensors, self.time_s, now_ns)
 
     def sense(self) -> Sensors:
         """What the car shows now; the driver looks once a step, however often this is asked."""
@@ -317,7 +323,7 @@ class Drive:
         self.sense()
         self.advance(none, self.pedal_brake_torque_nm())
         self.car, self._driver, self._hands, self._pedals, self.step = state, driver, hands, None, 0
-        self._faults = Faults(self.scenario.faults)
+        self._faults = Faults(self.scenario.faults, self._dt_s)
 
 
 def _road_row(

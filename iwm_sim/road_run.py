@@ -90,25 +90,27 @@ def give(controller: Controller, sensors: Sensors, drive: Drive, now_ns: int) ->
     monitor = controller.monitor
     monitor.direction = float(sensors.direction)
     if drive.scenario.imu:
-        monitor.take_motion("longitudinal_acceleration", sensors.acceleration_mps2, now_ns)
-        monitor.take_motion("yaw_rate", sensors.yaw_rate_radps, now_ns)
-        monitor.take_motion("lateral_acceleration", sensors.lateral_acceleration_mps2, now_ns)
-    if not drive.lost("vehicle_speed") and not math.isnan(sensors.speed_mps):
-        monitor.take_speed(SpeedReading(now_ns, sensors.speed_mps), now_ns)
-    if not drive.lost("wheel_states"):
-        monitor.take_wheels(JointReading(now_ns, WHEEL_NAMES, sensors.wheel_speed_radps), now_ns)
-        monitor.take_torques(JointReading(now_ns, WHEEL_NAMES, sensors.motor_torque_nm), now_ns)
-    if not drive.lost("battery_state"):
+        for _, shown in drive.arriving("imu", sensors, now_ns):
+            monitor.take_motion("longitudinal_acceleration", shown.acceleration_mps2, now_ns)
+            monitor.take_motion("yaw_rate", shown.yaw_rate_radps, now_ns)
+            monitor.take_motion("lateral_acceleration", shown.lateral_acceleration_mps2, now_ns)
+    for stamp_ns, shown in drive.arriving("vehicle_speed", sensors, now_ns):
+        if not math.isnan(shown.speed_mps):
+            monitor.take_speed(SpeedReading(stamp_ns, shown.speed_mps), now_ns)
+    for stamp_ns, shown in drive.arriving("wheel_states", sensors, now_ns):
+        monitor.take_wheels(JointReading(stamp_ns, WHEEL_NAMES, shown.wheel_speed_radps), now_ns)
+        monitor.take_torques(JointReading(stamp_ns, WHEEL_NAMES, shown.motor_torque_nm), now_ns)
+    for stamp_ns, shown in drive.arriving("battery_state", sensors, now_ns):
         battery = BatteryReading(
-            now_ns,
-            float(np.float32(sensors.soc)),
+            stamp_ns,
+            float(np.float32(shown.soc)),
             BATTERY_TEMPERATURE_DEGC,
-            sensors.battery_voltage_v,
-            sensors.battery_current_a,
+            shown.battery_voltage_v,
+            shown.battery_current_a,
         )
         monitor.take_battery(battery, now_ns)
-    if not drive.lost("power_demand"):
-        monitor.take_demand(sensors.power_demand_w, 0.0, now_ns)
+    for _, shown in drive.arriving("power_demand", sensors, now_ns):
+        monitor.take_demand(shown.power_demand_w, 0.0, now_ns)
 
 
 def drive_scenario(

@@ -24,6 +24,7 @@
       - {sensor: vehicle_speed, factor: 1.2, from_s: 2.0, until_s: 4.0}
       - {actuator: motor_front_left, dead: true, from_s: 2.0}
       - {message: power_demand, lost: true, from_s: 2.0}
+      - {message: wheel_states, delay_s: 0.02, jitter_s: 0.01}
     require:                                  # what must come out, by the names of `iwm_sim.road_measures`
       split_rate: {at_least: 1.0}
     aim:                                      # what is aimed at beyond that; said, and no failure
@@ -340,30 +341,37 @@ def _grade(path: Path, content: Any) -> tuple[tuple[float, float], ...]:
 def _faults(path: Path, content: Any) -> tuple[Fault, ...]:
     if not isinstance(content, list):
         raise ConfigError(path, "faults", f"{content!r} is no list", "entries with sensor, actuator or message")
-    return tuple(_fault(path, f"faults[{i}]", entry) for i, entry in enumerate(content))
+    return tuple(fault for i, entry in enumerate(content) for fault in _fault(path, f"faults[{i}]", entry))
 
 
-def _fault(path: Path, where: str, entry: Any) -> Fault:
+def _fault(path: Path, where: str, entry: Any) -> list[Fault]:
+    """What one entry says; of a message it may say several things."""
     what = [key for key in _FAULT_TARGETS if isinstance(entry, dict) and key in entry]
     if len(what) != 1:
         raise ConfigError(path, where, "names nothing that fails", "one of sensor, actuator, message")
     targets, kinds = _FAULT_TARGETS[what[0]]
     target = files.check_choice(path, f"{where}.{what[0]}", entry[what[0]], targets)
-    kind = [key for key in kinds if key in entry]
-    if len(kind) != 1:
+    kinds = {kind: allowed for kind, allowed in kinds.items() if target in faults.ONLY.get(kind, targets)}
+    files.check_keys(path, entry, (what[0],), (*kinds, "from_s", "until_s"), where)
+    named = [kind for kind in kinds if kind in entry]
+    message = what[0] == "message"
+    if not named or (len(named) > 1 and not message):
         raise ConfigError(path, where, "does not say what is wrong", f"one of {', '.join(kinds)}")
-    files.check_keys(path, entry, (what[0], kind[0]), ("from_s", "until_s"), where)
-    key = f"{where}.{kind[0]}"
-    value = 0.0
-    if kinds[kind[0]]:
-        value = files.check_number(path, key, entry[kind[0]], -1e6, 1e6)
-    elif files.check_bool(path, key, entry[kind[0]]) is not True:
-        raise ConfigError(path, key, "is false", "true")
     from_s = files.check_number(path, f"{where}.from_s", entry.get("from_s", 0.0), 0.0, _LONGEST_S, unit="s")
     until_s = math.inf
     if "until_s" in entry:
         until_s = files.check_number(path, f"{where}.until_s", entry["until_s"], from_s, _LONGEST_S, above=True)
-    return Fault(target, kind[0], value, from_s, until_s, what[0] == "message")
+    values = [_amount(path, f"{where}.{kind}", entry[kind], kinds[kind]) for kind in named]
+    return [Fault(target, kind, value, from_s, until_s, message) for kind, value in zip(named, values, strict=True)]
+
+
+def _amount(path: Path, key: str, value: Any, allowed: tuple[float, float, str] | None) -> float:
+    if allowed:
+        low, high, unit = allowed
+        return files.check_number(path, key, value, low, high, unit=unit)
+    if files.check_bool(path, key, value) is not True:
+        raise ConfigError(path, key, "is false", "true")
+    return 0.0
 
 
 def _bounds(path: Path, whole: Mapping[str, Any], section: str) -> list[Bound]:

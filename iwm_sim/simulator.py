@@ -110,7 +110,8 @@ def _scenario(values: Mapping[str, Any]) -> Scenario:
     if values["scenario_file"]:
         scenario = load_scenario(values["scenario_file"], idle_drive)
         if values["lockstep"] and any(fault.message for fault in scenario.faults):
-            raise ConfigError(scenario.path, "faults", "lose messages, and lock-step waits for each", "lockstep: false")
+            wrong = "has faults of messages, and lock-step waits for each as it is measured"
+            raise ConfigError(scenario.path, "faults", wrong, "lockstep: false")
         return dataclasses.replace(scenario, duration_s=min(scenario.duration_s, until_s))
     return on_cycle(
         load_vehicle(resolve(values["vehicle_file"]), idle_drive),
@@ -341,37 +342,38 @@ class Simulator(Node):
 
     def _publish_set(self) -> None:
         """Everything the car shows of itself at this step; `power_demand` closes the set."""
-        stamp_ns = self._stamp_ns
-        sensors = self._drive.sense()
+        now_ns = self._stamp_ns
         if self._simulated_time:
-            self._publish(m.CLOCK, m.clock_message(stamp_ns))
+            self._publish(m.CLOCK, m.clock_message(now_ns))
+        sensors = self._drive.sense()
         if self._drive.step % self._pedal_steps == 0:
             self._publish(m.ACCELERATOR_PEDAL, m.number_message(sensors.accelerator))
             self._publish(m.BRAKE_PEDAL, m.number_message(sensors.brake))
-        self._publish(m.VEHICLE_SPEED, m.vehicle_speed_message(stamp_ns, sensors.speed_mps))
-        self._publish(
-            m.WHEEL_STATES,
-            m.wheel_states_message(stamp_ns, self._wheel_names, sensors.wheel_speed_radps, sensors.motor_torque_nm),
-        )
-        self._publish(
-            m.BATTERY_STATE,
-            m.battery_state_message(
-                stamp_ns,
-                soc=sensors.soc,
-                voltage_v=sensors.battery_voltage_v,
-                discharge_current_a=sensors.battery_current_a,
-                capacity_ah=self._drive.capacity_ah,
-            ),
-        )
+        for stamp_ns, shown in self._drive.arriving(m.VEHICLE_SPEED, sensors, now_ns):
+            self._publish(m.VEHICLE_SPEED, m.vehicle_speed_message(stamp_ns, shown.speed_mps))
+        for stamp_ns, shown in self._drive.arriving(m.WHEEL_STATES, sensors, now_ns):
+            speeds, torques = shown.wheel_speed_radps, shown.motor_torque_nm
+            self._publish(m.WHEEL_STATES, m.wheel_states_message(stamp_ns, self._wheel_names, speeds, torques))
+        for stamp_ns, shown in self._drive.arriving(m.BATTERY_STATE, sensors, now_ns):
+            self._publish(
+                m.BATTERY_STATE,
+                m.battery_state_message(
+                    stamp_ns,
+                    soc=shown.soc,
+                    voltage_v=shown.battery_voltage_v,
+                    discharge_current_a=shown.battery_current_a,
+                    capacity_ah=self._drive.capacity_ah,
+                ),
+            )
         if self._moves_in_the_plane:
-            forward, left = sensors.acceleration_mps2, sensors.lateral_acceleration_mps2
-            self._publish(m.IMU, m.imu_message(stamp_ns, sensors.yaw_rate_radps, forward, left))
+            for stamp_ns, shown in self._drive.arriving(m.IMU, sensors, now_ns):
+                forward, left = shown.acceleration_mps2, shown.lateral_acceleration_mps2
+                self._publish(m.IMU, m.imu_message(stamp_ns, shown.yaw_rate_radps, forward, left))
             self._publish(m.DIRECTION, m.number_message(float(sensors.direction)))
-        self._publish(m.POWER_DEMAND, m.number_message(sensors.power_demand_w))
+        for _, shown in self._drive.arriving(m.POWER_DEMAND, sensors, now_ns):
+            self._publish(m.POWER_DEMAND, m.number_message(shown.power_demand_w))
 
     def _publish(self, topic: str, message: Any) -> None:
-        if self._drive.lost(topic):
-            return
         self._outputs[topic].publish(message)
         self._published[topic] += 1
 

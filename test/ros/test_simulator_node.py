@@ -314,7 +314,7 @@ def test_commands_that_stop_leave_motors_off_and_brakes_at_the_pedal(stand_in) -
         ({"scenario_file": "/nowhere/road.yaml"}, "/nowhere/road.yaml: cannot be read"),
         (
             {"scenario_file": "demand_lost", "lockstep": "true"},
-            "faults: lose messages, and lock-step waits for each; allowed: lockstep: false",
+            "faults: has faults of messages, and lock-step waits for each as it is measured; allowed: lockstep: false",
         ),
         ({"friction": 7.0}, "parameter friction: 7.0 is not allowed; allowed: 0.05 to 1.5"),
         ({"friction": ".nan"}, "parameter friction: nan is not allowed"),
@@ -456,6 +456,32 @@ def test_a_scenario_is_driven_as_its_file_says(tmp_path: Path, stand_in: Callabl
     assert run.road is not None
     first = RoadRow(*run.road[0])
     assert {first.road_fl, first.road_fr, first.road_rl, first.road_rr} == {0.2, 0.9}
+
+
+def test_in_real_time_a_late_message_comes_with_the_stamp_of_its_measurement(
+    tmp_path: Path, stand_in: Callable[..., StandIn]
+) -> None:
+    road = tmp_path / "late.yaml"
+    road.write_text(
+        "format: 1\nabout: A late speed.\nstart: {speed_mps: 5.0}\ndemand: [{from_s: 0.1, brake: 0.3}]\n"
+        "road: {friction: 0.9}\nuntil: {time_s: 2.0}\n"
+        "faults:\n  - {message: vehicle_speed, delay_s: 0.1}\n  - {message: battery_state, rate_hz: 10}\n"
+        "  - {message: wheel_states, delay_s: 0.04, stamp_error_s: 0.04}\n"
+    )
+    car = stand_in(lockstep=False, scenario_file=road, rate_hz=50.0, command_timeout_s=10.0)
+    run, notes = car.run()
+    period_ns, steps = notes["period_ns"], len(run.series)
+    assert notes["published"][m.VEHICLE_SPEED] == steps - 5
+    assert notes["published"][m.WHEEL_STATES] == steps - 2
+    assert notes["published"][m.BATTERY_STATE] == steps / 5
+    assert notes["published"][m.POWER_DEMAND] == steps
+    # Stamps follow the clock where the timer is late, so that each step has its own.
+    speeds = {readings.vehicle_speed(each).stamp_ns: each for each in car.received[m.VEHICLE_SPEED]}
+    imus = [m.stamp_to_ns(each.header.stamp) for each in car.received[m.IMU]]
+    assert list(speeds) == imus[: steps - 5]
+    shown = [readings.vehicle_speed(each).speed_mps for each in speeds.values()]
+    np.testing.assert_array_equal(shown, run["speed_mps"][: steps - 5])
+    assert stamps(car, m.WHEEL_STATES) == [stamp + 2 * period_ns for stamp in imus[: steps - 2]]
 
 
 @pytest.mark.parametrize(("scenario", "direction"), [("split_stop", 1.0), ("hill_start_reverse", -1.0)])

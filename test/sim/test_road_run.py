@@ -111,6 +111,36 @@ def test_a_lost_message_degrades_the_power_manager():
     assert 2.0 in set(mode[55:95])
 
 
+INPUTS = ("vehicle_speed", "wheel_states", "power_demand", "battery_state", "imu")
+
+
+def test_a_late_message_tells_the_power_manager_its_age_unless_its_stamp_lies():
+    def ages_s(topics, **wrong):
+        faults = tuple(Fault(t, kind, value, 0.0, 99.0, message=True) for t in topics for kind, value in wrong.items())
+        scenario = dataclasses.replace(STOP, faults=faults)
+        manager, shown = road_run.controller_of(scenario, EQUAL), Drive(scenario, dt_s=0.01)
+        for now_ns in range(10**9, 10**9 + 60_000_000, 10_000_000):
+            road_run.give(manager, shown.sense(), shown, now_ns)
+        return manager.monitor.ages_s(now_ns)
+
+    late, lying = INPUTS[:2], ("wheel_states", "battery_state")
+    assert ages_s(late, delay_s=0.02) == (0.02, 0.02, 0.0, 0.0)
+    assert ages_s(lying, delay_s=0.02, stamp_error_s=0.01) == (0.0, 0.01, 0.0, 0.01)
+    assert ages_s(("vehicle_speed",), rate_hz=50.0) == (0.01, 0.0, 0.0, 0.0)
+
+
+def test_what_arrives_without_a_delay_gives_the_same_bits_and_20_ms_later_others():
+    def driven(**wrong):
+        faults = tuple(Fault(t, kind, value, 0.0, 99.0, message=True) for t in INPUTS for kind, value in wrong.items())
+        return drive(dataclasses.replace(STOP, faults=faults, imu=True, duration_s=1.0)).series
+
+    plain = driven()
+    np.testing.assert_array_equal(driven(delay_s=0.0, jitter_s=0.0, stamp_error_s=0.0, rate_hz=100.0), plain)
+    late = driven(delay_s=0.02, jitter_s=0.005)
+    assert not np.array_equal(late, plain)
+    np.testing.assert_array_equal(driven(delay_s=0.02, jitter_s=0.005), late)
+
+
 def test_requirements_are_checked_and_said():
     bounds = (Bound("stopping_distance_m", -math.inf, 20.0), Bound("steering_deg", 1.0, math.inf))
     result = road_run.check_scenario(
