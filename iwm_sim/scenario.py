@@ -5,14 +5,14 @@
     about: one sentence                       # what it shows
     vehicle: jalalmaab_2015                   # file or name; optional
     load_kg: 0.0                              # what the car carries and the power manager does not know; optional
-    start: {speed_mps: 25.0, soc: 0.8}        # optional
+    start: {speed_mps: 25.0, soc: 0.8}        # optional; a cycle has its own speed
     cycle: nycc                               # either a speed trace ...
     demand:                                   # ... or what the driver does, each until the next: one of accelerator,
       - {from_s: 1.0, brake: 1.0}             #     brake (0..1), power_w (W at the wheels), braking_mps2
     steering: lane                            # lane: a driver keeps the lane; or a list of from_s, wheel_deg; optional
     direction: forward                        # or reverse: the direction asked for; optional
     road:
-      friction: 0.9                           # a number, or a list of from_m, left, right (or friction)
+      friction: 0.9                           # a number, or a list of from_m, left, right (or friction), from 0
       grade: 0.0                              # a number, or a list of from_m, grade
       headwind_mps: 0.0
     assumed_friction: 0.9                     # what the power manager is told; optional: the road's at its start
@@ -46,7 +46,7 @@ from iwm_power_manager import files
 from iwm_power_manager.cycle import MAX_GRADE, Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError, one_line
 from iwm_power_manager.model.parameters import VehicleParams
-from iwm_power_manager.share import resolve
+from iwm_power_manager.share import did_you_mean, resolve
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
 from iwm_sim import faults
 from iwm_sim.faults import Fault
@@ -57,6 +57,7 @@ DEFAULT_VEHICLE = "config/vehicles/jalalmaab_2015.yaml"
 FOLDER = "config/scenarios"
 
 _LONGEST_S = 86400.0
+_FILES = "a file, or the name of one of the package"
 _KEYS = (
     "vehicle",
     "load_kg",
@@ -189,6 +190,8 @@ def load_scenario(name: Path | str, idle_drive: str | None = None, vehicle: Vehi
         raise ConfigError(path, "", "needs exactly one of cycle, demand", "cycle | demand")
     cycle = load_cycle(_file(path, "cycle", content["cycle"])) if "cycle" in content else None
     start = files.check_keys(path, content.get("start", {}), (), ("speed_mps", "soc"), "start")
+    if cycle and "speed_mps" in start:
+        raise ConfigError(path, "start.speed_mps", "stands beside a cycle, which begins at its own", "cycle without it")
     first = float(cycle.speed_mps[0]) if cycle else 0.0
     road = files.check_keys(path, content["road"], ("friction",), ("grade", "headwind_mps"), "road")
     friction = _friction(path, road["friction"])
@@ -226,9 +229,17 @@ def load_scenario(name: Path | str, idle_drive: str | None = None, vehicle: Vehi
 
 def _file(path: Path, key: str, name: Any) -> Path:
     if not isinstance(name, str):
-        raise ConfigError(path, key, f"{name!r} is no file name", "a file, or the name of one of the package")
+        raise ConfigError(path, key, f"{name!r} is no file name", _FILES)
     beside = path.parent / name
-    return beside if os.path.isfile(beside) else resolve(name)
+    if os.path.isfile(beside):
+        return beside
+    try:
+        found = resolve(name)
+    except ConfigError as error:
+        raise ConfigError(path, key, str(error)) from None
+    if not os.path.isfile(found):
+        raise ConfigError(path, key, f"{name!r} is no file", f"{_FILES}{did_you_mean(beside)}")
+    return found
 
 
 def _loaded(vehicle: VehicleParams, load_kg: float) -> VehicleParams:
@@ -315,7 +326,10 @@ def _friction(path: Path, content: Any) -> tuple[Friction, ...]:
         both = coefficient("road.friction", content)
         return (Friction(0.0, both, both),)
     result = []
-    for where, entry in _listed(path, "road.friction", content, "from_m", -1e6):
+    entries = _listed(path, "road.friction", content, "from_m", -1e6)
+    where, first = entries[0]
+    files.check_number(path, f"{where}.from_m", first["from_m"], high=0.0, unit="m: the car starts at 0")
+    for where, entry in entries:
         if "friction" in entry:
             files.check_keys(path, entry, ("from_m", "friction"), (), where)
             left = right = coefficient(f"{where}.friction", entry["friction"])
