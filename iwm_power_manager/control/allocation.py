@@ -76,24 +76,26 @@ def drive(
     growth = speed_part(speed, s) * s.yaw_rate_growth_nmps
     rate, lateral = measurement.yaw_rate_radps, measurement.lateral_mps2
     yaw = yaw_step(state.yaw, rate, lateral, speed, lasting_s, growth, braking, dt)
-    targets = slip_targets(front_s, braking, yaw.believed, measurement.motor_gain, before, s)
-    front_alike = alike_wheels(0, measurement, before, targets)
-    rear_alike = alike_wheels(2, measurement, before, targets)
 
     # 1. slip, wheel by wheel; an axle's is that of its worse wheel
     w = measurement.wheel_speed_radps
     fl_slip = wheel_slip(w[0], speed, dt, first, before[0], vehicle.front, settings)
-    fr_slip = fl_slip if front_alike else wheel_slip(w[1], speed, dt, first, before[1], vehicle.front, settings)
+    fr_slip = wheel_slip(w[1], speed, dt, first, before[1], vehicle.front, settings)
     rl_slip = wheel_slip(w[2], speed, dt, first, before[2], vehicle.rear, settings)
-    rr_slip = rl_slip if rear_alike else wheel_slip(w[3], speed, dt, first, before[3], vehicle.rear, settings)
+    rr_slip = wheel_slip(w[3], speed, dt, first, before[3], vehicle.rear, settings)
+    slips = (fl_slip, fr_slip, rl_slip, rr_slip)
     front_slip = worse_slip(fl_slip, fr_slip)
     rear_slip = worse_slip(rl_slip, rr_slip)
+    brakes = state.motion.brake_gain
+    front_brakes = vehicle.front.friction_brake.max_torque_nm > 0.0 and min(brakes[0], brakes[1]) == 1.0
+    targets = slip_targets(front_s, speed, braking, yaw.believed, slips, front_brakes, s)
+    front_alike = alike_wheels(0, measurement, before, targets)
+    rear_alike = alike_wheels(2, measurement, before, targets)
 
     # 2. split
     memory = split(measurement, speed, front_slip, rear_slip, first, state.split, settings, vehicle, policy)
 
     # 3. gate, 4. capacity
-    slips = (fl_slip, fr_slip, rl_slip, rr_slip)
     # Of wheels that are alike none slips alone.
     least_nm = (0.0, 0.0, 0.0, 0.0) if front_alike and rear_alike else least_road_nm(before, vehicle)
     front_nm = yaw_moments_nm(s.front_yaw_nm, s.front_yaw_growth_nmps, s.front_yaw_most_nm, front_s, speed, braking, s)

@@ -12,7 +12,7 @@ from iwm_power_manager.control.direction import MOVING_MPS
 from iwm_power_manager.control.one_road import UNEQUAL_PART
 from iwm_power_manager.control.settings import GATE_MODE_TABLE2, Settings
 from iwm_power_manager.control.slew import slewed
-from iwm_power_manager.control.slip import worse_slip
+from iwm_power_manager.control.slip import LEAST_SLIP_SPEED_MPS, worse_slip
 from iwm_power_manager.control.types import (
     LIMIT_FRICTION_BRAKE,
     LIMIT_MOTOR,
@@ -101,23 +101,35 @@ def unequal_s(before_s: float, left: Wheel, right: Wheel, wanted: bool, dt_s: fl
 
 @kernel
 def slip_targets(
-    unequal_s: float, braking: bool, watched: bool, gain: Wheels, before: FourWheels, settings: Settings
+    unequal_s: float,
+    speed_mps: float,
+    braking: bool,
+    watched: bool,
+    slips: Wheels,
+    front_brakes: bool,
+    settings: Settings,
 ) -> Wheels:
     """Slip the limiter holds each wheel at.
 
     Unequal torques of the front wheels have to be steered against, with the front wheel that grips; and they turn the
     car, which the rear wheels keep straight: both need to keep something of their grip for that; less of it where the
-    yaw rate is `watched`. A motor that does not obey turns the car until it is found, and the driver swings back: rear
-    wheels that slip no more than the front ones keep it straight meanwhile.
+    yaw rate is `watched`.
+
+    Where braked rear wheels use more of their grip than the front ones, what has turned the car, a bump or a motor that
+    does not obey, turns it on, the faster the more they slip and the car goes. So above a slip that goes with one over
+    the speed they slip no more than the front ones; and at the limit of the road all wheels give what they can. Left
+    alone are slow cars, a rear axle of which a wheel rolls, torques that have just become unequal (a bump or two
+    roads), and front wheels whose `front_brakes` are another system's or weak: they may not take over.
     """
     most = settings.slip_target
     if not braking:
         return (most, most, most, most)
     if abs(unequal_s) <= UNEQUAL_S:
+        part = max(settings.yaw_speed_mps / max(speed_mps, MOVING_MPS), 1.0)
+        slipping = -max(slips[2], slips[3]) * speed_mps > LEAST_SLIP_SPEED_MPS
         behind = most
-        if min(gain[0], gain[1], gain[2], gain[3]) < 1.0:
-            front = -max(before[0].slip, before[1].slip)
-            behind = min(most, max(settings.unequal_rear_slip_target, front))
+        if front_brakes and slipping and unequal_s == 0.0 and part < MOST_YAW_SPEED:
+            behind = min(most, max(part * settings.unequal_rear_slip_target, -max(slips[0], slips[1])))
         return (most, most, behind, behind)
     high = min(most, max(settings.unequal_slip_target, WATCHED_SLIP if watched else 0.0))
     low = min(most, settings.unequal_low_slip_target)

@@ -112,7 +112,9 @@ class Case(NamedTuple):
 
     @property
     def slip_targets(self):
-        return oracle.slip_targets(self.before, self.settings, self.braking, self.after.yaw.believed, self.m.motor_gain)
+        slips, believed = [wheel.slip for wheel in self.after.wheels], self.after.yaw.believed
+        speed = self.m.speed_mps
+        return oracle.slip_targets(self.before, slips, speed, self.braking, believed, self.settings, self.car)
 
     def fast(self, i):
         return max(self.m.wheel_speed_radps[i], self.conversion(i))
@@ -922,23 +924,23 @@ def test_without_friction_brakes_all_four_motors_regenerate_as_much_as_they_can(
 
 @pytest.mark.parametrize(("demand", "friction"), [(-60e3, 0.5), (-60e3, 0.2), (30e3, 0.2), (30e3, 0.1)])
 def test_the_limiter_holds_the_wheel_at_its_target_slip(demand, friction):
-    """Wheels at a constant 15 m/s on tyres that give far less than is asked for."""
+    """Each wheel at a constant 15 m/s on a tyre that gives far less than is asked for."""
     speed, dt = 15.0, 0.01
     load = CAR.chassis.mass_kg * G / 4.0
-    wheel, slips, gates, state = speed / RADIUS, [], [], initial_state()
+    wheels, slips, gates, state = [speed / RADIUS] * 4, [], [], initial_state()
     for _ in range(150):
-        m = measurement(demand=demand, wheel_speed_radps=(wheel,) * 4)
-        case = take(m, state)
+        case = take(measurement(demand=demand, wheel_speed_radps=tuple(wheels)), state)
         state = case.after
-        torque = case.command.motor_torque_nm[0] + case.command.friction_torque_nm[0]
-        for _ in range(20):
-            x = oracle.slip(wheel, speed, RADIUS, 0.5)
-            road = RADIUS * load * friction_coefficient(x, friction, CAR.front.tyre)
-            wheel = max(wheel + dt / 20 * (torque - road) / CAR.front.wheel.inertia_kgm2, 0.0)
-        slips.append(oracle.slip(wheel, speed, RADIUS, 0.5))
+        torques = zip(case.command.motor_torque_nm, case.command.friction_torque_nm, strict=True)
+        for k, torque in enumerate(map(sum, torques)):
+            for _ in range(20):
+                x = oracle.slip(wheels[k], speed, RADIUS, 0.5)
+                road = RADIUS * load * friction_coefficient(x, friction, CAR.front.tyre)
+                wheels[k] = max(wheels[k] + dt / 20 * (torque - road) / CAR.front.wheel.inertia_kgm2, 0.0)
+        slips.append([oracle.slip(wheel, speed, RADIUS, 0.5) for wheel in wheels])
         gates.append(case.command.gate)
-    assert slips[-1] == pytest.approx(math.copysign(DEFAULT.slip_target, demand), abs=0.01)
-    assert max(map(abs, slips)) < 0.2
+    assert slips[-1] == pytest.approx([math.copysign(DEFAULT.slip_target, demand)] * 4, abs=0.01)
+    assert max(abs(slip) for wheels in slips for slip in wheels) < 0.2
     assert set(gates) == {t.GATE_NONE}
     assert case.command.limits & t.LIMIT_SLIP
 

@@ -367,9 +367,8 @@ def test_the_commands_are_the_same_from_any_side(turn: Turn) -> None:
         if isinstance(turn, EndForEnd):
             # Steering against unequal brakes is the front wheels' matter.
             state = state._replace(front_unequal_s=0.0, rear_unequal_s=0.0)
-            if m.power_demand_w < 0.0:
-                # So is what rear wheels may slip at most beside a motor that does not obey.
-                m = m._replace(motor_gain=(1.0, 1.0, 1.0, 1.0))
+            # And the rear wheels alone are held to the slip of the others.
+            tuned = tuned._replace(unequal_rear_slip_target=0.9)
         command, after = law.step(m, state, tuned, scene.car, TABLE)
         other_command, other_after = law.step(turn.of(m), turn.of(state), turn.of(tuned), turn.car(scene.car), TABLE)
         if isinstance(turn, EndForEnd) and max(command.hold_nm, other_command.hold_nm) > 0.0:

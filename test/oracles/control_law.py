@@ -168,17 +168,22 @@ def known_yaw(m, state, settings):
     return now
 
 
-def slip_targets(state, settings, braking, believed, gains):
+def slip_targets(state, slips, speed, braking, believed, settings, vehicle):
     """Slip the limiter steers each wheel to: less while left and right are braked unequally.
 
-    Less of that where a yaw rate is believed. With a motor that is not whole, the rear slip no more than the front.
+    Less of that where a yaw rate is believed. Else, faster than 10 m/s, rear wheels that slip follow the front ones,
+    if those have brakes.
     """
     unequal = state.front_unequal_s
     if not braking or -0.03 <= unequal <= 0.03:
         front = rear = settings.slip_target
-        if braking and any(gain < 1.0 for gain in gains):
-            least = min(-wheel.slip for wheel in state.wheels[:2])
-            rear = min(rear, max(least, settings.unequal_rear_slip_target))
+        whole = vehicle.front.friction_brake.max_torque_nm > 0.0 and not any(
+            gain < 1.0 for gain in state.motion.brake_gain[:2]
+        )
+        both_slip = all(-slip * speed > 0.3 for slip in slips[2:])
+        if braking and not unequal and whole and both_slip and 2.0 * speed > settings.yaw_speed_mps:
+            allowed = settings.unequal_rear_slip_target * max(settings.yaw_speed_mps / speed, 1.0)
+            rear = min(rear, max(allowed, min(-slip for slip in slips[:2])))
         return [front, front, rear, rear]
     high, rear = settings.unequal_slip_target, settings.unequal_rear_slip_target
     if believed:
@@ -298,10 +303,15 @@ def step(m, state, settings, vehicle, decide):
     braking = m.power_demand_w < 0.0
     bits = set()
     yaw = known_yaw(m, state, settings)
-    targets = slip_targets(state, settings, braking, yaw.believed, m.motor_gain)
+    slips = []
+    for i, (speed, before) in enumerate(zip(m.wheel_speed_radps, state.wheels, strict=True)):
+        radius = (vehicle.front if i < 2 else vehicle.rear).wheel.radius_m
+        now = slip(speed, m.speed_mps, radius, settings.slip_speed_floor_mps)
+        slips.append(now if first else low_pass(before.slip, now, m.dt_s, settings.slip_filter_s))
+    targets = slip_targets(state, slips, m.speed_mps, braking, yaw.believed, settings, vehicle)
     standing = braking and m.speed_mps < settings.slip_speed_floor_mps
     wheels = [
-        Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i], targets[i])
+        Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i], targets[i], slip=slips[i])
         for i, speed in enumerate(m.wheel_speed_radps)
     ]
     front, rear = axles = [
@@ -314,8 +324,6 @@ def step(m, state, settings, vehicle, decide):
     ]
 
     for k, wheel in enumerate(wheels):
-        now = slip(wheel.speed, m.speed_mps, wheel.axle.wheel.radius_m, settings.slip_speed_floor_mps)
-        wheel.slip = now if first else low_pass(wheel.before.slip, now, m.dt_s, settings.slip_filter_s)
         if not first:
             other = wheels[k ^ 1]
             alike = abs(wheel.speed - other.speed) * wheel.axle.wheel.radius_m < 0.3
