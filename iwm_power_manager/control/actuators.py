@@ -7,9 +7,11 @@ of reported to commanded torque over that time: dead, weak, reversed, or stuck w
 The torque the law may count on is `gain` times what it commands; a motor that does not follow is switched off.
 
 Reports are only judged once some motor has been seen to follow its commands: a car that fills the field with zeros does
-not report, nor does one all of whose motors seem to be stuck or reversed. What else was found stays until the next
-activation, except a weak motor that follows again for `recover_s`, and four that seem dead until one follows: their
-reports may be dead instead, so that driving is still tried.
+not report, nor does one all of whose motors seem to be stuck or reversed. Before that only a motor is judged that
+reports far more than it was commanded, while the others report what they were, one of them no less: that is no report
+that is missing, late, unsigned or in other units. What else was found stays until the next activation, except a weak
+motor that follows again for `recover_s`, and four that seem dead until one follows: their reports may be dead instead,
+so that driving is still tried.
 
 Pure functions over numbers; one call a step for each motor.
 """
@@ -142,13 +144,15 @@ def judge(state: ActuatorState, reported_nm: Wheels, dt_s: float, limits: Actuat
         return state
     sent = zip(*[torque_nm for _, torque_nm in state.recent], strict=True)
     reports = [(reported, min(one), max(one)) for reported, one in zip(reported_nm, sent, strict=True)]
-    if state.all_dead or not state.reporting:
-        if any(_follows(*report, limits) for report in reports):
-            state = ActuatorState(recent=state.recent)
-        elif not state.reporting:
-            return state
-    a, b, c, d = (_judged(motor, *report, dt_s, limits) for motor, report in zip(state.motors, reports, strict=True))
-    judged = ActuatorState((a, b, c, d), state.recent, True)
+    if (state.all_dead or not state.reporting) and any(_follows(*report, limits) for report in reports):
+        state = ActuatorState((Evidence(),) * 4 if state.all_dead else state.motors, state.recent, True)
+    a, b, c, d = (
+        _judged(motor, *report, dt_s, limits)
+        if state.reporting or motor.verdict is not MotorVerdict.GOOD or _alone_astray(k, reports, limits)
+        else Evidence()
+        for k, (motor, report) in enumerate(zip(state.motors, reports, strict=True))
+    )
+    judged = ActuatorState((a, b, c, d), state.recent, state.reporting)
     if all(motor.verdict in (MotorVerdict.STUCK, MotorVerdict.REVERSED) for motor in judged.motors):
         return ActuatorState(recent=state.recent)  # four motors do not get stuck at once: the reports did
     return judged
@@ -158,11 +162,28 @@ def _tolerance_nm(least_nm: float, most_nm: float, limits: ActuatorLimits) -> fl
     return limits.tolerance_nm + limits.tolerance_ratio * max(abs(least_nm), abs(most_nm))
 
 
+def _within(reported_nm: float, least_nm: float, most_nm: float, limits: ActuatorLimits) -> bool:
+    """Whether a report is one of what was commanded, give or take the tolerance."""
+    tolerance = _tolerance_nm(least_nm, most_nm, limits)
+    return least_nm - tolerance <= reported_nm <= most_nm + tolerance
+
+
 def _follows(reported_nm: float, least_nm: float, most_nm: float, limits: ActuatorLimits) -> bool:
     """Whether a report can only come from a motor that follows: a torque that is clearly there, and as commanded."""
     tolerance = _tolerance_nm(least_nm, most_nm, limits)
     clear = min(abs(least_nm), abs(most_nm)) > 2.0 * tolerance and least_nm * most_nm > 0.0
-    return clear and least_nm - tolerance <= reported_nm <= most_nm + tolerance
+    return clear and _within(reported_nm, least_nm, most_nm, limits)
+
+
+def _alone_astray(k: int, reports: list[tuple[float, float, float]], limits: ActuatorLimits) -> bool:
+    """Whether a motor reports far more than commanded, beside three that report what was, one of them no less."""
+    most = [max(abs(least_nm), abs(most_nm)) for _, least_nm, most_nm in reports]
+    others = [i for i in range(len(reports)) if i != k]
+    return (
+        abs(reports[k][0]) > most[k] + 2.0 * _tolerance_nm(*reports[k][1:], limits)
+        and all(_within(*reports[i], limits) for i in others)
+        and any(most[i] >= most[k] for i in others)
+    )
 
 
 def _judged(
@@ -173,9 +194,9 @@ def _judged(
     if motor.verdict not in (MotorVerdict.GOOD, MotorVerdict.WEAK):
         off = max(abs(least_nm), abs(most_nm)) <= limits.tolerance_nm
         return _switched_off(motor, reported_nm, dt_s, limits) if off else motor
-    tolerance = _tolerance_nm(least_nm, most_nm, limits)
-    if least_nm - tolerance <= reported_nm <= most_nm + tolerance:
-        return _inside(motor, max(abs(least_nm), abs(most_nm)) > 2.0 * tolerance, dt_s, limits)
+    if _within(reported_nm, least_nm, most_nm, limits):
+        clear = max(abs(least_nm), abs(most_nm)) > 2.0 * _tolerance_nm(least_nm, most_nm, limits)
+        return _inside(motor, clear, dt_s, limits)
     nearest = min(max(reported_nm, least_nm), most_nm)
     motor = motor._replace(
         outside_s=motor.outside_s + dt_s,

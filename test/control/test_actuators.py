@@ -109,6 +109,62 @@ def test_a_motor_dead_from_the_start_is_found_as_soon_as_another_follows():
     assert states[-1].motors[0].verdict is MotorVerdict.DEAD
 
 
+@pytest.mark.parametrize("wheel", range(4))
+@pytest.mark.parametrize("torque", [-10.0, 0.0, 10.0, 14.0])
+@pytest.mark.parametrize("stuck", [-80.0, 60.0, 150.0])
+def test_a_motor_stuck_from_the_start_is_found_before_any_has_followed_a_clear_torque(wheel, torque, stuck):
+    report = [torque + 2.0] * 4
+    report[wheel] = stuck
+    states = drive(ActuatorState(), steady(torque), [report] * 60)
+    assert (first_found(states, wheel) + 1) * DT <= 0.2
+    assert states[-1].gains == tuple(float(i != wheel) for i in range(4))
+    assert not states[-1].reporting
+    # Switched off, it still pulls; the others begin to follow, and are judged by that.
+    told = [60.0] * 4
+    told[wheel] = 0.0
+    after = [60.0] * 4
+    after[wheel] = stuck
+    states = drive(states[-1], [tuple(told)] * 40, [after] * 40)
+    assert all(state.gains == tuple(float(i != wheel) for i in range(4)) for state in states)
+    assert states[-1].reporting
+    assert states[-1].stuck_nm == tuple(stuck if i == wheel else 0.0 for i in range(4))
+
+
+REPORTS = {
+    "none": lambda torque: math.nan,
+    "zeros": lambda torque: 0.0,
+    "unsigned": abs,
+    "turned round": lambda torque: -torque,
+    "in hundredths": lambda torque: 100.0 * torque,
+    "of a motor behind a gear": lambda torque: torque / 9.0,
+    "of a wheel in front of one": lambda torque: 9.0 * torque,
+}
+
+
+@given(
+    st.lists(
+        st.tuples(*[st.sampled_from((-80.0, -14.0, -5.0, 0.0, 0.5, 5.0, 14.0, 100.0))] * 4), min_size=1, max_size=8
+    ),
+    st.lists(st.integers(1, 30), min_size=8, max_size=8),
+    st.integers(0, 5),
+    st.sampled_from(sorted(REPORTS)),
+)
+def test_reports_that_are_no_torques_of_motors_switch_none_off(torques, steps, lag, kind):
+    commands = [torque for torque, times in zip(torques, steps, strict=False) for _ in range(times)]
+    late = [(0.0,) * 4] * lag + commands
+    reports = [tuple(map(REPORTS[kind], torque)) for torque in late[: len(commands)]]
+    state = commanded(ActuatorState(), (0.0,) * 4, DT, LIMITS)
+    for after in drive(state, commands, reports):
+        if after.reporting:
+            break  # a torque in between that happens to be right
+        assert after.gains == (1.0,) * 4
+
+
+def test_one_report_gone_wrong_before_any_motor_has_followed_is_forgotten():
+    reports = [(80.0, 0.0, 0.0, 0.0)] * 8 + [(0.0,) * 4] + [(80.0, 0.0, 0.0, 0.0)] * 8
+    assert drive(ActuatorState(), steady(0.0, 17), reports)[-1].gains == (1.0,) * 4
+
+
 @pytest.mark.parametrize("torque", [0.0, 60.0])
 def test_what_is_not_reported_is_not_judged(torque):
     state = drive(following(), steady(torque), [(math.nan,) * 4] * 60)[-1]
