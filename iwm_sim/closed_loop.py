@@ -288,6 +288,7 @@ def measure(
         math.nan,
         math.nan,
         math.nan,
+        (0.0, 0.0, 0.0, 0.0),
     )
 
 

@@ -45,6 +45,7 @@ class ActuatorLimits(NamedTuple):
     lag_s : a report may belong to any command of this time
     confirm_s : how long reports have to be outside before a motor is judged
     recover_s : how long a weak motor has to follow before it counts as good again
+    delay_s : time after which a command is a torque, of motors and brakes
     """
 
     tolerance_nm: float
@@ -52,6 +53,7 @@ class ActuatorLimits(NamedTuple):
     lag_s: float
     confirm_s: float
     recover_s: float
+    delay_s: float
 
 
 class Evidence(NamedTuple):

@@ -12,10 +12,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from iwm_power_manager.control.actuators import ActuatorLimits, ActuatorState, commanded, judge
+from iwm_power_manager.control.alignment import LATEST_S, NO_SHIFT, Alignment, arrived_nm
 from iwm_power_manager.control.execution import COMPILED, Execution
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
-from iwm_power_manager.control.monitor import InputLimits, InputMonitor
+from iwm_power_manager.control.monitor import WHEELS, InputLimits, InputMonitor
 from iwm_power_manager.control.motion import DOUBT_SPEED
 from iwm_power_manager.control.record import Watch, to_numbers
 from iwm_power_manager.control.settings import Settings
@@ -116,6 +117,8 @@ class Controller:
         self._before.value = initial_state()
         self._assumed_friction: float | None = None
         self.command: Command | None = None
+        front, rear = self._vehicle.front.wheel.inertia_kgm2, self._vehicle.rear.wheel.inertia_kgm2
+        self._alignment = Alignment((front, front, rear, rear), self._limits.actuators.delay_s)
 
     def _run_by(self, execution: Execution, state: ControllerState) -> None:
         vehicle, before, after = map(execution.hold, (self._vehicle, initial_state(), initial_state()))
@@ -167,7 +170,7 @@ class Controller:
         self._watch_motors(dt_s)
         self._follow_estimate()
         measurement = self._measurement(now_ns, dt_s)
-        settings = self._settings()
+        settings = self._settings(age_s[1])
         command, decided, assumed = self.execution.advance(
             measurement, self._before, self._after, settings, self._held_vehicle, self.policy
         )
@@ -179,6 +182,8 @@ class Controller:
         self._before, self._after = self._after, self._before
         self._assumed_friction = assumed
         self.command = command
+        if self._limits.age_s:
+            self._alignment.applied(now_ns, arrived_nm(command, measurement))
         self.actuators = commanded(self.actuators, command.motor_torque_nm, dt_s, self._limits.actuators)
         return Step(command, values)
 
@@ -223,6 +228,10 @@ class Controller:
             chassis, floor_mps = self._vehicle.chassis, self._vehicle.driver.power_speed_floor_mps
             demand = min(demand, TRIED_MPS2 * chassis.mass_kg * max(abs(command.speed_mps), floor_mps))
             gains = (1.0, 1.0, 1.0, 1.0)
+        wheels_ns = monitor.tallies[WHEELS].accepted_ns
+        shift = NO_SHIFT
+        if self._limits.age_s and wheels_ns is not None and wheels is monitor.wheel_speed_radps:
+            shift = self._alignment.shift_nm(now_ns, dt_s, wheels_ns, wheels)
         discharge, charge = self.execution.battery_limits(monitor.soc, monitor.temperature_c, self._held_vehicle)
         factor = supervision.motor_factor
         return Measurement(
@@ -240,10 +249,14 @@ class Controller:
             acceleration_mps2=monitor.motion("longitudinal_acceleration", now_ns),
             yaw_rate_radps=monitor.motion("yaw_rate", now_ns),
             lateral_mps2=monitor.motion("lateral_acceleration", now_ns),
+            torque_shift_nm=shift,
         )
 
-    def _settings(self) -> Settings:
+    def _settings(self, wheels_age_s: float) -> Settings:
         settings, factor = self.settings, LOST_WHEEL_SLIP_FACTOR
+        if wheels_age_s > 0.0:
+            # A loop with a delay swings unless it is slower than that by as much.
+            settings = settings._replace(slip_limiter_s=settings.slip_limiter_s + min(wheels_age_s, LATEST_S))
         if self.execution.strategy is not None:
             settings = settings._replace(strategy=self.execution.strategy)
         if not self.wheels_lost:

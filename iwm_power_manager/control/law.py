@@ -31,7 +31,7 @@ from iwm_power_manager.control.friction import estimate as friction_estimate
 from iwm_power_manager.control.motion import Motion, estimate
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.table import PolicyTable
-from iwm_power_manager.control.types import Command, ControllerState, FrictionState, Measurement, Wheels
+from iwm_power_manager.control.types import Command, ControllerState, FrictionState, Measurement, Wheels, WheelState
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.parameters import VehicleParams
 
@@ -64,6 +64,7 @@ def _believed(measurement: Measurement, motion: Motion, travel: float, settings:
         m.acceleration_mps2,
         travel * m.yaw_rate_radps,
         m.lateral_mps2,
+        m.torque_shift_nm,
     )
 
 
@@ -97,6 +98,43 @@ def _answered(
 
 
 @kernel
+def _shifted(wheel: WheelState, shift_nm: float) -> WheelState:
+    return WheelState(
+        wheel.motor_nm,
+        wheel.total_nm + shift_nm,
+        wheel.speed_radps,
+        wheel.road_nm,
+        wheel.slip,
+        wheel.gated,
+        wheel.heat,
+    )
+
+
+@kernel
+def _aligned(state: ControllerState, shift_nm: Wheels) -> ControllerState:
+    """What is remembered, with the torques that belong to how the wheels' speeds have changed."""
+    a, b, c, d = state.wheels
+    travel = state.travel
+    return ControllerState(
+        steps=state.steps,
+        split=state.split,
+        wheels=(
+            _shifted(a, travel * shift_nm[0]),
+            _shifted(b, travel * shift_nm[1]),
+            _shifted(c, travel * shift_nm[2]),
+            _shifted(d, travel * shift_nm[3]),
+        ),
+        front_unequal_s=state.front_unequal_s,
+        rear_unequal_s=state.rear_unequal_s,
+        yaw=state.yaw,
+        motion=state.motion,
+        travel=travel,
+        hold_nm=state.hold_nm,
+        friction=state.friction,
+    )
+
+
+@kernel
 def step(
     measurement: Measurement,
     state: ControllerState,
@@ -116,6 +154,7 @@ def step(
     Command, ControllerState
     """
     m = measurement
+    state = _aligned(state, m.torque_shift_nm)
     motion, motion_after = estimate(m, state.motion, state.wheels, state.travel, state.steps == 0, vehicle)
     travel = travel_direction(motion.speed_mps, m.power_demand_w, m.direction, state.travel)
     before = turned_to(state, motion_after, travel)

@@ -48,6 +48,12 @@ _MEASUREMENT = (
     Signal("gyroscope", "1 where there is one, 0 where not"),
     Signal("lateral_mps2", "of an accelerometer, positive to the left"),
     Signal("lateral_accelerometer", "1 where there is one, 0 where not"),
+    *(
+        Signal(
+            f"{wheel}_torque_shift_nm", "torque while its speed changed, less the last command's (0: nothing is late)"
+        )
+        for wheel in WHEEL_NAMES
+    ),
 )
 _COMMAND = (
     *(Signal(f"{wheel}_motor_torque_nm", "commanded motor torque") for wheel in WHEEL_NAMES),
@@ -139,6 +145,7 @@ def to_numbers(
         0.0 if math.isnan(measurement.yaw_rate_radps) else 1.0,
         0.0 if math.isnan(measurement.lateral_mps2) else measurement.lateral_mps2,
         0.0 if math.isnan(measurement.lateral_mps2) else 1.0,
+        *measurement.torque_shift_nm,
         *decided,
         *supervision[:4],
         watch.wheels_lost,
@@ -156,6 +163,7 @@ YOUNGER_SIGNALS = (
     | {f"{wheel}_brake_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_gain": 1.0 for wheel in WHEEL_NAMES}
     | {f"{wheel}_motor_stuck_nm": 0.0 for wheel in WHEEL_NAMES}
+    | {f"{wheel}_torque_shift_nm": 0.0 for wheel in WHEEL_NAMES}
     | {"left_friction": 0.0, "right_friction": 0.0, "left_friction_confidence": 0.0, "right_friction_confidence": 0.0}
 )
 _YOUNGER = YOUNGER_SIGNALS | {_SETTING + name: float(value) for name, value in DEFAULTS._asdict().items()}
@@ -234,6 +242,7 @@ def measurement_of(numbers: Sequence[float]) -> Measurement:
         acceleration_mps2=n[20] if n[21] else math.nan,
         yaw_rate_radps=n[22] if n[23] else math.nan,
         lateral_mps2=n[24] if n[25] else math.nan,
+        torque_shift_nm=(n[26], n[27], n[28], n[29]),
     )
 
 

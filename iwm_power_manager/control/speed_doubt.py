@@ -164,7 +164,9 @@ def compared_speeds(
         return before, factor, False
     if before.lasted_s >= COMPARED_S:
         # Wheels that show by themselves what the sensor does are right again; a wrong sensor is not wrong by a factor.
-        over = freely and _unsure(before) and (_same(shown, mean / factor) or apart_s > APART_S)
+        # While a torque turns, the road takes next to nothing for a moment.
+        still = freely and used_friction_of(t.torque_nm, t) < ROLLING_FRICTION
+        over = still and _unsure(before) and (_same(shown, mean / factor) or apart_s > APART_S)
         if over:
             return Compared(1.0, before.lasted_s), 1.0, True
         # By the sign of the road's force, which is that of the slip: a torque may have turned just now.

@@ -65,6 +65,8 @@ class Measurement(NamedTuple):
     acceleration_mps2 : forward, of an accelerometer on the body, the slope's part included (NaN: there is none)
     yaw_rate_radps : of a gyroscope on the body, positive to the left (NaN: there is none)
     lateral_mps2 : of an accelerometer on the body, positive to the left (NaN: there is none)
+    torque_shift_nm : added to the torques of the last command, the torques that the wheels had while their speeds
+        changed, forwards positive; 0 where the speeds are of this very moment
     """
 
     speed_mps: float
@@ -81,6 +83,7 @@ class Measurement(NamedTuple):
     acceleration_mps2: float = math.nan
     yaw_rate_radps: float = math.nan
     lateral_mps2: float = math.nan
+    torque_shift_nm: Wheels = (0.0, 0.0, 0.0, 0.0)
 
 
 class Command(NamedTuple):

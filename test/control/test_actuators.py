@@ -26,7 +26,7 @@ from iwm_power_manager.control.types import Measurement, initial_state
 from iwm_power_manager.share import resolve
 from iwm_power_manager.vehicle import load_vehicle
 
-LIMITS = ActuatorLimits(tolerance_nm=6.0, tolerance_ratio=0.1, lag_s=0.05, confirm_s=0.1, recover_s=2.0)
+LIMITS = ActuatorLimits(tolerance_nm=6.0, tolerance_ratio=0.1, lag_s=0.05, confirm_s=0.1, recover_s=2.0, delay_s=0.0)
 DT = 0.01
 
 

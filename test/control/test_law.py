@@ -1197,3 +1197,16 @@ def test_below_walking_pace_no_brake_is_gated():
     m = measurement(speed=0.9, demand=-3000.0, wheel_speed_radps=(0.0,) * 4)
     assert take(m).command.gated_wheels == 0
     assert take(m._replace(speed_mps=1.1)).command.gated_wheels == 15
+
+
+@pytest.mark.parametrize("travel", [1.0, -1.0])
+def test_a_shift_of_torque_counts_as_torque_that_was_applied(travel):
+    """Of inputs that are late: forwards positive, whichever way the car travels."""
+    before = initial_state()._replace(steps=5, travel=travel)
+    shift = (10.0, -20.0, 30.0, -40.0)
+    wheels = [wheel._replace(total_nm=-50.0, speed_radps=30.0) for wheel in before.wheels]
+    shifted = [wheel._replace(total_nm=-50.0 + travel * nm) for wheel, nm in zip(wheels, shift, strict=True)]
+    m = moving(travel * 10.0, -20e3, travel)
+    found = whole(m._replace(torque_shift_nm=shift), before._replace(wheels=tuple(wheels)))
+    assert found == whole(m, before._replace(wheels=tuple(shifted)))
+    assert found != whole(m, before._replace(wheels=tuple(wheels)))

@@ -42,6 +42,7 @@ MEASUREMENT = Measurement(
     acceleration_mps2=unlike(),
     yaw_rate_radps=unlike(),
     lateral_mps2=unlike(),
+    torque_shift_nm=four(),
 )
 COMMAND = Command(
     motor_torque_nm=four(),
@@ -107,6 +108,7 @@ def test_every_number_stands_under_its_own_name():
         "gyroscope": 1.0,
         "lateral_mps2": MEASUREMENT.lateral_mps2,
         "lateral_accelerometer": 1.0,
+        **{f"{wheel}_torque_shift_nm": nm for wheel, nm in zip(WHEEL_NAMES, MEASUREMENT.torque_shift_nm, strict=True)},
         **of_wheels("{}_motor_torque_nm", COMMAND.motor_torque_nm),
         **of_wheels("{}_friction_torque_nm", COMMAND.friction_torque_nm),
         **of_wheels("{}_brake_gain", COMMAND.brake_gain),

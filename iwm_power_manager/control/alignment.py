@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which torque a wheel had while its speed changed by what is shown.
+
+What the road takes from a wheel is told by its torque, and by how its speed changed meanwhile. Wheel speeds come late,
+several at a time or not at all, so that the torque of the last step is not the one that belongs to them: the slip
+limiter would answer its own torque, and swing. Stamps say when speeds were measured; the torques of then are looked up.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from iwm_power_manager.control.types import Command, Measurement, Wheels
+
+_NS_PER_S = 1e9
+#: Wheel speeds that are older belong to no torque that is remembered.
+LATEST_S = 0.25
+#: Speeds measured within this part of a step are too near to each other to tell a torque.
+_LEAST_PART = 0.5
+#: Where messages stay away for longer, what the road takes is not known any more.
+_SILENT_NS = 60_000_000
+NO_SHIFT: Wheels = (0.0, 0.0, 0.0, 0.0)
+
+
+def arrived_nm(command: Command, measurement: Measurement) -> Wheels:
+    """Torque at each wheel by a command, as far as motors and brakes are known, N m, forwards positive."""
+    gain, stuck, brakes = measurement.motor_gain, measurement.motor_stuck_nm, command.brake_gain
+    motor, friction, turning = command.motor_torque_nm, command.friction_torque_nm, measurement.wheel_speed_radps
+    a, b, c, d = (
+        gain[i] * motor[i] + stuck[i] + (brakes[i] if turning[i] >= 0.0 else -brakes[i]) * friction[i] for i in range(4)
+    )
+    return a, b, c, d
+
+
+class Alignment:
+    """Torques of the last moments, held against the stamps of wheel speeds.
+
+    Parameters
+    ----------
+    inertia_kgm2 : of each wheel
+    delay_s : time after which a command is a torque
+    """
+
+    def __init__(self, inertia_kgm2: Sequence[float], delay_s: float) -> None:
+        self._inertia_kgm2 = inertia_kgm2
+        self._delay_ns = round(delay_s * _NS_PER_S)
+        self.forget()
+
+    def forget(self) -> None:
+        """Start again without history: as at activation, or after the clock was set back."""
+        self._torques: deque[tuple[int, Wheels]] = deque()
+        self._last_radps: Wheels | None = None
+        self._since_ns, self._since_radps = 0, NO_SHIFT
+        self._road_nm: Wheels | None = None
+        self._newest_ns = self._arrived_ns = 0
+
+    def applied(self, now_ns: int, torque_nm: Wheels) -> None:
+        """Note the torques that are commanded now."""
+        torques = self._torques
+        torques.append((now_ns, torque_nm))
+        while len(torques) > 1 and torques[1][0] < now_ns - self._delay_ns - 2.0 * LATEST_S * _NS_PER_S:
+            torques.popleft()
+
+    def shift_nm(self, now_ns: int, dt_s: float, stamp_ns: int, speed_radps: Wheels) -> Wheels:
+        """What to add to the torques commanded last, to get those that explain how the wheels' speeds have changed.
+
+        Parameters
+        ----------
+        now_ns, dt_s : of the step
+        stamp_ns, speed_radps : of the newest wheel speeds
+
+        Returns
+        -------
+        Wheels
+            N m, forwards positive
+        """
+        if self._torques and now_ns <= self._torques[-1][0]:
+            self.forget()
+        if stamp_ns != self._newest_ns:
+            self._newest_ns, self._arrived_ns = stamp_ns, now_ns
+        before, since_s = self._last_radps, (stamp_ns - self._since_ns) / _NS_PER_S
+        self._last_radps = speed_radps
+        if before is None or not self._torques:
+            self._since_ns, self._since_radps = stamp_ns, speed_radps
+            return NO_SHIFT
+        inertia, road, last = self._inertia_kgm2, self._road_nm, self._torques[-1][1]
+        if not 0.0 <= since_s <= LATEST_S:
+            # After a gap in the messages nobody knows what the road took in it.
+            self._since_ns, self._since_radps = stamp_ns, speed_radps
+        elif since_s >= _LEAST_PART * dt_s:
+            mean = self._mean_nm(self._since_ns - self._delay_ns, stamp_ns - self._delay_ns)
+            start = self._since_radps
+            a, b, c, d = (mean[i] - inertia[i] * (speed_radps[i] - start[i]) / since_s for i in range(4))
+            self._road_nm = road = a, b, c, d
+            self._since_ns, self._since_radps = stamp_ns, speed_radps
+        if road is None or now_ns - self._arrived_ns > _SILENT_NS:
+            return NO_SHIFT
+        a, b, c, d = (road[i] + inertia[i] * (speed_radps[i] - before[i]) / dt_s - last[i] for i in range(4))
+        return a, b, c, d
+
+    def _mean_nm(self, from_ns: int, to_ns: int) -> Wheels:
+        """Mean of the torques that acted between two times; the first that is remembered stands for those before."""
+        total = [0.0, 0.0, 0.0, 0.0]
+        end = to_ns
+        for k in range(len(self._torques) - 1, -1, -1):
+            begin_ns, torque = self._torques[k]
+            begin = max(begin_ns, from_ns) if k else from_ns
+            if begin < end:
+                part = (end - begin) / (to_ns - from_ns)
+                total = [t + part * nm for t, nm in zip(total, torque, strict=True)]
+                end = begin
+            if end <= from_ns:
+                break
+        a, b, c, d = total
+        return a, b, c, d
