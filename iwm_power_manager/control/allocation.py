@@ -41,6 +41,8 @@ from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.model.torque import allocate
 
+#: Deceleration beyond which a driver wants all that the road gives, m/s2: half of a full pedal, twice what 0.2 gives.
+GENTLE_MPS2 = 4.0
 #: Part of the demand that sums and differences of powers may lose without a limit having bitten.
 ROUNDING = 1e-12
 
@@ -87,8 +89,12 @@ def drive(
     front_slip = worse_slip(fl_slip, fr_slip)
     rear_slip = worse_slip(rl_slip, rr_slip)
     brakes = state.motion.brake_gain
-    front_brakes = vehicle.front.friction_brake.max_torque_nm > 0.0 and min(brakes[0], brakes[1]) == 1.0
-    targets = slip_targets(front_s, speed, braking, yaw.believed, slips, front_brakes, s)
+    front_first = (
+        vehicle.front.friction_brake.max_torque_nm > 0.0
+        and min(brakes[0], brakes[1]) == 1.0
+        and -measurement.power_demand_w <= GENTLE_MPS2 * vehicle.chassis.mass_kg * speed
+    )
+    targets = slip_targets(front_s, speed, braking, yaw.believed, slips, front_first, s)
     front_alike = alike_wheels(0, measurement, before, targets)
     rear_alike = alike_wheels(2, measurement, before, targets)
 

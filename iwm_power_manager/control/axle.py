@@ -106,7 +106,7 @@ def slip_targets(
     braking: bool,
     watched: bool,
     slips: Wheels,
-    front_brakes: bool,
+    front_first: bool,
     settings: Settings,
 ) -> Wheels:
     """Slip the limiter holds each wheel at.
@@ -119,7 +119,8 @@ def slip_targets(
     does not obey, turns it on, the faster the more they slip and the car goes. So above a slip that goes with one over
     the speed they slip no more than the front ones; and at the limit of the road all wheels give what they can. Left
     alone are slow cars, a rear axle of which a wheel rolls, torques that have just become unequal (a bump or two
-    roads), and front wheels whose `front_brakes` are another system's or weak: they may not take over.
+    roads), and where the front wheels do not come first: their brakes are another system's or weak, and may not take
+    over, or the driver asks for more than gentle braking.
     """
     most = settings.slip_target
     if not braking:
@@ -128,7 +129,7 @@ def slip_targets(
         part = max(settings.yaw_speed_mps / max(speed_mps, MOVING_MPS), 1.0)
         slipping = -max(slips[2], slips[3]) * speed_mps > LEAST_SLIP_SPEED_MPS
         behind = most
-        if front_brakes and slipping and unequal_s == 0.0 and part < MOST_YAW_SPEED:
+        if front_first and slipping and unequal_s == 0.0 and part < MOST_YAW_SPEED:
             behind = min(most, max(part * settings.unequal_rear_slip_target, -max(slips[0], slips[1])))
         return (most, most, behind, behind)
     high = min(most, max(settings.unequal_slip_target, WATCHED_SLIP if watched else 0.0))

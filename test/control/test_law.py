@@ -113,8 +113,8 @@ class Case(NamedTuple):
     @property
     def slip_targets(self):
         slips, believed = [wheel.slip for wheel in self.after.wheels], self.after.yaw.believed
-        speed = self.m.speed_mps
-        return oracle.slip_targets(self.before, slips, speed, self.braking, believed, self.settings, self.car)
+        speed, demand = self.m.speed_mps, self.m.power_demand_w
+        return oracle.slip_targets(self.before, slips, speed, demand, believed, self.settings, self.car)
 
     def fast(self, i):
         return max(self.m.wheel_speed_radps[i], self.conversion(i))

@@ -168,12 +168,13 @@ def known_yaw(m, state, settings):
     return now
 
 
-def slip_targets(state, slips, speed, braking, believed, settings, vehicle):
+def slip_targets(state, slips, speed, demand, believed, settings, vehicle):
     """Slip the limiter steers each wheel to: less while left and right are braked unequally.
 
     Less of that where a yaw rate is believed. Else, faster than 10 m/s, rear wheels that slip follow the front ones,
-    if those have brakes.
+    if those have brakes and no more than 4 m/s2 are asked for.
     """
+    braking = demand < 0.0
     unequal = state.front_unequal_s
     if not braking or -0.03 <= unequal <= 0.03:
         front = rear = settings.slip_target
@@ -181,7 +182,8 @@ def slip_targets(state, slips, speed, braking, believed, settings, vehicle):
             gain < 1.0 for gain in state.motion.brake_gain[:2]
         )
         both_slip = all(-slip * speed > 0.3 for slip in slips[2:])
-        if braking and not unequal and whole and both_slip and 2.0 * speed > settings.yaw_speed_mps:
+        gentle = demand >= -4.0 * vehicle.chassis.mass_kg * speed
+        if braking and gentle and not unequal and whole and both_slip and 2.0 * speed > settings.yaw_speed_mps:
             allowed = settings.unequal_rear_slip_target * max(settings.yaw_speed_mps / speed, 1.0)
             rear = min(rear, max(allowed, min(-slip for slip in slips[:2])))
         return [front, front, rear, rear]
@@ -308,7 +310,7 @@ def step(m, state, settings, vehicle, decide):
         radius = (vehicle.front if i < 2 else vehicle.rear).wheel.radius_m
         now = slip(speed, m.speed_mps, radius, settings.slip_speed_floor_mps)
         slips.append(now if first else low_pass(before.slip, now, m.dt_s, settings.slip_filter_s))
-    targets = slip_targets(state, slips, m.speed_mps, braking, yaw.believed, settings, vehicle)
+    targets = slip_targets(state, slips, m.speed_mps, m.power_demand_w, yaw.believed, settings, vehicle)
     standing = braking and m.speed_mps < settings.slip_speed_floor_mps
     wheels = [
         Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i], targets[i], slip=slips[i])
