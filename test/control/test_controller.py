@@ -58,8 +58,8 @@ STALE_ALL = STALE_SPEED | STALE_WHEELS | STALE_DEMAND | STALE_BATTERY
 class Drive:
     """A controller and its clock."""
 
-    def __init__(self, limits: ControllerLimits = LIMITS, strategy: str = "equal") -> None:
-        self.controller = Controller(VEHICLE, NAMES, limits, default_settings(strategy), empty_table(), 0.9)
+    def __init__(self, limits: ControllerLimits = LIMITS, strategy: str = "equal", vehicle: Any = VEHICLE) -> None:
+        self.controller = Controller(vehicle, NAMES, limits, default_settings(strategy), empty_table(), 0.9)
         self.now_ns = 1000 * MS
         self.steps: list[dict[str, float]] = []
         self.commands: list[Any] = []
@@ -263,6 +263,30 @@ class TestStandIns:
     def test_a_car_that_stands_or_rolls_back_a_little_is_seen_as_it_is(self, drive, wheel, speed) -> None:
         drive.run(60, speed=0.0)
         assert drive.run(10, wheels=(wheel,) * 4, without=("speed",))["speed_mps"] == speed
+
+
+class TestLateWheels:
+    def test_the_limiter_is_slower_by_the_age_of_the_wheel_speeds_alone(self, drive) -> None:
+        drive.run(60)
+        drive.run(1, without=("wheels",))
+        values = drive.run(1, without=("wheels", "battery"))
+        ages = [values[f"{name}_age_s"] for name in ("vehicle_speed", "wheel_states", "battery_state")]
+        assert ages == pytest.approx([0.01, 0.03, 0.02])
+        assert values["setting.slip_limiter_s"] == default_settings("equal").slip_limiter_s + ages[1]
+
+    def test_what_the_road_takes_is_told_by_each_wheels_own_inertia(self) -> None:
+        """Without torque, wheels that lose a radian a second in each step are braked by the road."""
+        axles = [
+            axle._replace(wheel=axle.wheel._replace(inertia_kgm2=i))
+            for axle, i in zip(VEHICLE[1:3], (1.0, 2.0), strict=True)
+        ]
+        drive = Drive(vehicle=VEHICLE._replace(front=axles[0], rear=axles[1]))
+        for k in range(40):
+            drive.run(1, demand=0.0, wheels=(10.0 / RADIUS - 0.1 * k,) * 4)
+        values = drive.run(1, demand=0.0, without=("wheels",))
+        assert motor(values) == [0.0] * 4
+        shifts = [values[f"{wheel}_torque_shift_nm"] for wheel in NAMES]
+        assert shifts == pytest.approx([10.0, 10.0, 20.0, 20.0], abs=0.1)
 
 
 class TestLostWheel:
