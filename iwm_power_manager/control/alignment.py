@@ -59,6 +59,7 @@ class Alignment:
         """Note the torques that are commanded now."""
         torques = self._torques
         torques.append((now_ns, torque_nm))
+        # Of speeds that are as old as may be, since those before, which may be as much older.
         while len(torques) > 1 and torques[1][0] < now_ns - self._delay_ns - 2.0 * LATEST_S * _NS_PER_S:
             torques.popleft()
 

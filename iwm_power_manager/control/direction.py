@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from iwm_power_manager.control.motion import Motion
-from iwm_power_manager.control.types import ControllerState, Measurement, MotionState, WheelState
+from iwm_power_manager.control.types import ControllerState, FourWheels, Measurement, MotionState, WheelState
 from iwm_power_manager.control.yaw import no_yaw
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.chassis import GRAVITY_MPS2
@@ -35,9 +35,9 @@ def _turned(wheel: WheelState) -> WheelState:
 
 
 @kernel
-def turned_to(state: ControllerState, motion: MotionState, travel: float) -> ControllerState:
-    """What is remembered, in the direction of travel of this step, with what is known of the motion now."""
-    a, b, c, d = state.wheels
+def turned_to(state: ControllerState, wheels: FourWheels, motion: MotionState, travel: float) -> ControllerState:
+    """What is remembered, in the direction of travel of this step, with what is known of wheels and motion now."""
+    a, b, c, d = wheels
     yaw = state.yaw
     if travel != state.travel:
         yaw = no_yaw()

@@ -31,7 +31,15 @@ from iwm_power_manager.control.friction import estimate as friction_estimate
 from iwm_power_manager.control.motion import Motion, estimate
 from iwm_power_manager.control.settings import Settings
 from iwm_power_manager.control.table import PolicyTable
-from iwm_power_manager.control.types import Command, ControllerState, FrictionState, Measurement, Wheels, WheelState
+from iwm_power_manager.control.types import (
+    Command,
+    ControllerState,
+    FourWheels,
+    FrictionState,
+    Measurement,
+    Wheels,
+    WheelState,
+)
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.parameters import VehicleParams
 
@@ -111,26 +119,15 @@ def _shifted(wheel: WheelState, shift_nm: float) -> WheelState:
 
 
 @kernel
-def _aligned(state: ControllerState, shift_nm: Wheels) -> ControllerState:
-    """What is remembered, with the torques that belong to how the wheels' speeds have changed."""
+def _aligned(state: ControllerState, shift_nm: Wheels) -> FourWheels:
+    """What is remembered of the wheels, with the torques that belong to how their speeds have changed."""
     a, b, c, d = state.wheels
     travel = state.travel
-    return ControllerState(
-        steps=state.steps,
-        split=state.split,
-        wheels=(
-            _shifted(a, travel * shift_nm[0]),
-            _shifted(b, travel * shift_nm[1]),
-            _shifted(c, travel * shift_nm[2]),
-            _shifted(d, travel * shift_nm[3]),
-        ),
-        front_unequal_s=state.front_unequal_s,
-        rear_unequal_s=state.rear_unequal_s,
-        yaw=state.yaw,
-        motion=state.motion,
-        travel=travel,
-        hold_nm=state.hold_nm,
-        friction=state.friction,
+    return (
+        _shifted(a, travel * shift_nm[0]),
+        _shifted(b, travel * shift_nm[1]),
+        _shifted(c, travel * shift_nm[2]),
+        _shifted(d, travel * shift_nm[3]),
     )
 
 
@@ -154,10 +151,10 @@ def step(
     Command, ControllerState
     """
     m = measurement
-    state = _aligned(state, m.torque_shift_nm)
-    motion, motion_after = estimate(m, state.motion, state.wheels, state.travel, state.steps == 0, vehicle)
+    wheels = _aligned(state, m.torque_shift_nm)
+    motion, motion_after = estimate(m, state.motion, wheels, state.travel, state.steps == 0, vehicle)
     travel = travel_direction(motion.speed_mps, m.power_demand_w, m.direction, state.travel)
-    before = turned_to(state, motion_after, travel)
+    before = turned_to(state, wheels, motion_after, travel)
     believed = _believed(m, motion, travel, settings)
     grip = friction_estimate(
         state.friction,

@@ -49,9 +49,7 @@ _MEASUREMENT = (
     Signal("lateral_mps2", "of an accelerometer, positive to the left"),
     Signal("lateral_accelerometer", "1 where there is one, 0 where not"),
     *(
-        Signal(
-            f"{wheel}_torque_shift_nm", "torque while its speed changed, less the last command's (0: nothing is late)"
-        )
+        Signal(f"{wheel}_torque_shift_nm", "torque while its speed changed, less the last command's (0 in lock-step)")
         for wheel in WHEEL_NAMES
     ),
 )

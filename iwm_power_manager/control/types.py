@@ -66,7 +66,7 @@ class Measurement(NamedTuple):
     yaw_rate_radps : of a gyroscope on the body, positive to the left (NaN: there is none)
     lateral_mps2 : of an accelerometer on the body, positive to the left (NaN: there is none)
     torque_shift_nm : added to the torques of the last command, the torques that the wheels had while their speeds
-        changed, forwards positive; 0 where the speeds are of this very moment
+        changed, forwards positive; 0 in lock-step
     """
 
     speed_mps: float

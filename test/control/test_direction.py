@@ -26,7 +26,7 @@ def test_what_is_remembered_of_a_wheel_has_the_other_sign_after_the_car_has_turn
     wheels = (remembered(0), remembered(1), remembered(2), remembered(3))
     state = initial_state()._replace(wheels=wheels, travel=-travel)
     motion = state.motion._replace(speed_mps=0.5)
-    after = turned_to(state, motion, travel)
+    after = turned_to(state, wheels, motion, travel)
     assert (after.travel, after.motion) == (travel, motion)
     for old, new in zip(wheels, after.wheels, strict=True):
         assert (new.motor_nm, new.speed_radps, new.road_nm) == (-old.motor_nm, -old.speed_radps, -old.road_nm)
@@ -39,7 +39,7 @@ def test_what_is_remembered_of_a_wheel_has_the_other_sign_after_the_car_has_turn
 def test_nothing_changes_while_the_direction_stays(travel):
     wheels = (remembered(0), remembered(1), remembered(2), remembered(3))
     state = initial_state()._replace(wheels=wheels, travel=travel)
-    assert turned_to(state, state.motion, travel) == state
+    assert turned_to(state, wheels, state.motion, travel) == state
 
 
 @pytest.mark.parametrize("before", [1.0, -1.0])
