@@ -94,7 +94,8 @@ def drive(
         and min(brakes[0], brakes[1]) == 1.0
         and -measurement.power_demand_w <= GENTLE_MPS2 * vehicle.chassis.mass_kg * speed
     )
-    targets = slip_targets(front_s, speed, braking, yaw.believed, slips, front_first, s)
+    gain = measurement.motor_gain
+    targets = slip_targets(front_s, speed, braking, yaw.believed, slips, front_first, gain, s)
     front_alike = alike_wheels(0, measurement, before, targets)
     rear_alike = alike_wheels(2, measurement, before, targets)
 

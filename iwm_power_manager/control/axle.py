@@ -40,6 +40,8 @@ MOST_YAW_SPEED = 2.0
 #: Slip of the front wheel that grips, and of the rear ones, where the yaw rate is watched.
 WATCHED_SLIP = 0.1
 WATCHED_REAR_SLIP = 0.06
+#: Slip of a driven front wheel beside one that has less of its motor, at `yaw_speed_mps`: what a driver hardly feels.
+BESIDE_WEAK_SLIP = 0.01
 
 
 class Given(NamedTuple):
@@ -100,6 +102,30 @@ def unequal_s(before_s: float, left: Wheel, right: Wheel, wanted: bool, dt_s: fl
 
 
 @kernel
+def _driven_slip_targets(speed_mps: float, slips: Wheels, motor_gain: Wheels, settings: Settings) -> Wheels:
+    """Slip the limiter holds each driven wheel at: `slip_target`, unless a motor gives less than it should.
+
+    The front wheel whose motor gives more than the other's slips no more than that one: so what turns the car is little
+    on a road that has little to hold it with, and all that the motor has on a good one. The rear wheels slip no more
+    than the front ones, or they would have nothing to hold it with. What they may slip all the same goes with one over
+    the square of the speed, as yaw budgets do; at the rear at low speed with one over the speed, as where they brake.
+    """
+    most = settings.slip_target
+    front_left, front_right, rear_left, rear_right = motor_gain
+    left = right = rear = most
+    part = settings.yaw_speed_mps / max(speed_mps, MOVING_MPS)
+    if front_left != front_right:
+        weaker = slips[1] if front_left > front_right else slips[0]
+        beside = min(most, max(part * part * BESIDE_WEAK_SLIP, weaker))
+        left, right = (beside, most) if front_left > front_right else (most, beside)
+    lost = min(front_left, front_right, rear_left, rear_right) < 1.0
+    if lost and min(slips[2], slips[3]) * speed_mps > LEAST_SLIP_SPEED_MPS:
+        least = min(part, part * part) * settings.unequal_rear_slip_target
+        rear = min(most, max(least, min(slips[0], slips[1])))
+    return left, right, rear, rear
+
+
+@kernel
 def slip_targets(
     unequal_s: float,
     speed_mps: float,
@@ -107,6 +133,7 @@ def slip_targets(
     watched: bool,
     slips: Wheels,
     front_first: bool,
+    motor_gain: Wheels,
     settings: Settings,
 ) -> Wheels:
     """Slip the limiter holds each wheel at.
@@ -124,7 +151,7 @@ def slip_targets(
     """
     most = settings.slip_target
     if not braking:
-        return (most, most, most, most)
+        return _driven_slip_targets(speed_mps, slips, motor_gain, settings)
     if abs(unequal_s) <= UNEQUAL_S:
         part = max(settings.yaw_speed_mps / max(speed_mps, MOVING_MPS), 1.0)
         slipping = -max(slips[2], slips[3]) * speed_mps > LEAST_SLIP_SPEED_MPS

@@ -20,7 +20,12 @@ MOST, LEAST = SETTINGS.slip_target, SETTINGS.unequal_rear_slip_target
 
 def targets(*slips: float, speed: float = 20.0, braking: bool = True, unequal_s: float = 0.0, brakes: bool = True):
     """Slip each wheel is held at, with wheels that slip so."""
-    return slip_targets(unequal_s, speed, braking, False, slips, brakes, SETTINGS)
+    return slip_targets(unequal_s, speed, braking, False, slips, brakes, (1.0,) * 4, SETTINGS)
+
+
+def driven_targets(*slips: float, gain: tuple[float, ...], speed: float = 20.0, braking: bool = False):
+    """The same of wheels that are driven by motors that give so much of their torque."""
+    return slip_targets(0.0, speed, braking, False, slips, True, gain, SETTINGS)
 
 
 @pytest.mark.parametrize("fronts", [(-0.06, -0.08), (-0.08, -0.06)])
@@ -79,3 +84,43 @@ def test_a_turn_grows_no_faster_than_a_driver_sees_it_where_rear_wheels_slip_as_
     rear = targets(-front, -front, -0.2, -0.2, speed=speed)[2]
     assert growth_per_s(front, rear, speed, 0.2) <= 1.0
     assert growth_per_s(front, MOST, speed, 0.2) > 1.3
+
+
+@pytest.mark.parametrize("weak", [0.0, 0.5, 0.9])
+@pytest.mark.parametrize("wheel", [0, 1])
+def test_a_driven_front_wheel_beside_a_weaker_motor_slips_no_more_than_that_one_s(wheel, weak):
+    gain = tuple(weak if i == wheel else 1.0 for i in range(4))
+    for slip, own in ((0.06, 0.16), (0.1, 0.16), (0.06, 0.03)):
+        slips = tuple(slip if i == wheel else own for i in range(4))
+        found = driven_targets(*slips, gain=gain)
+        assert found[:2] == tuple(MOST if i == wheel else slip for i in range(2))
+    assert driven_targets(*(0.5,) * 4, gain=gain) == (MOST,) * 4
+    assert driven_targets(*(0.16,) * 4, gain=(weak, weak, 1.0, 1.0))[:2] == (MOST, MOST)
+
+
+def test_with_one_of_their_own_motors_lost_too_driven_rear_wheels_slip_no_more_than_the_front_ones():
+    for gain in ((0.0, 0.0, 1.0, 1.0), (1.0, 1.0, 0.5, 1.0), (1.0, 1.0, 1.0, 0.5)):
+        for fronts in ((0.06, 0.1), (0.1, 0.06)):
+            assert driven_targets(*fronts, 0.16, 0.16, gain=gain) == (MOST, MOST, 0.06, 0.06)
+
+
+def test_what_they_may_slip_all_the_same_goes_with_the_square_of_the_speed():
+    def least(speed):
+        return driven_targets(0.0, 0.0, 0.2, 0.2, gain=(0.0, 1.0, 1.0, 1.0), speed=speed)[1:3]
+
+    assert least(20.0) == pytest.approx((0.01, LEAST))
+    assert least(30.0) == pytest.approx((0.01 / 2.25, LEAST / 2.25))
+    assert least(10.0) == pytest.approx((0.04, 2.0 * LEAST))
+    assert least(0.0) == (MOST, MOST)
+
+
+def test_with_whole_motors_or_where_a_rear_wheel_rolls_all_driven_wheels_may_slip_alike():
+    assert driven_targets(0.0, 0.0, 0.2, 0.2, gain=(1.0,) * 4) == (MOST,) * 4
+    for rears in ((0.2, 0.014), (0.014, 0.2)):
+        assert driven_targets(0.0, 0.0, *rears, gain=(0.0, 0.0, 1.0, 1.0)) == (MOST,) * 4
+    assert driven_targets(0.0, 0.0, 0.016, 0.016, gain=(0.0, 0.0, 1.0, 1.0))[2:] == (LEAST, LEAST)
+
+
+def test_braking_a_lost_motor_changes_no_slip():
+    """The friction brakes do its work."""
+    assert driven_targets(0.0, 0.0, -0.01, -0.01, gain=(0.0, 1.0, 1.0, 1.0), braking=True) == (MOST,) * 4

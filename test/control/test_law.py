@@ -113,8 +113,8 @@ class Case(NamedTuple):
     @property
     def slip_targets(self):
         slips, believed = [wheel.slip for wheel in self.after.wheels], self.after.yaw.believed
-        speed, demand = self.m.speed_mps, self.m.power_demand_w
-        return oracle.slip_targets(self.before, slips, speed, demand, believed, self.settings, self.car)
+        speed, demand, gains = self.m.speed_mps, self.m.power_demand_w, self.m.motor_gain
+        return oracle.slip_targets(self.before, slips, speed, demand, gains, believed, self.settings, self.car)
 
     def fast(self, i):
         return max(self.m.wheel_speed_radps[i], self.conversion(i))
@@ -546,7 +546,7 @@ def it_does_what_the_plain_law_does(case):
     assert {name for bit, name in t.LIMIT_NAMES.items() if command.limits & bit} == {t.LIMIT_NAMES[x] for x in bits}
     for i, state in enumerate(after.wheels):
         assert state.motor_nm == ours[i][0]
-        assert state.total_nm == near(sum(ours[i]))
+        assert state.total_nm == near(case.m.motor_gain[i] * ours[i][0] + case.m.motor_stuck_nm[i] + ours[i][1])
         assert state.speed_radps == case.m.wheel_speed_radps[i]
         assert state.road_nm == near(wheels[i].road)
         assert state.slip == near(wheels[i].slip)
@@ -611,6 +611,22 @@ def test_all_of_it_holds_with_a_gyroscope_and_an_accelerometer(measurement, rate
     case = take(measurement._replace(yaw_rate_radps=rate, lateral_mps2=felt), state, tuning, car)
     for check in CHECKS:
         check(case)
+
+
+@settings(max_examples=EXAMPLES)
+@given(
+    measurement=measurements(),
+    gains=st.tuples(*[st.sampled_from((1.0, 1.0, 0.0, 0.25))] * 4),
+    stuck=st.tuples(*[st.sampled_from((0.0, 40.0, -40.0))] * 4),
+    state=MEMORIES,
+    tuning=TUNINGS,
+    car=st.sampled_from(list(CARS.values())),
+)
+def test_motors_that_are_lost_are_done_without_as_in_the_plain_law(measurement, gains, stuck, state, tuning, car):
+    stuck = tuple(nm if gain == 0.0 else 0.0 for nm, gain in zip(stuck, gains, strict=True))
+    it_does_what_the_plain_law_does(
+        take(measurement._replace(motor_gain=gains, motor_stuck_nm=stuck), state, tuning, car)
+    )
 
 
 @settings(max_examples=EXAMPLES)

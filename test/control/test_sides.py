@@ -369,6 +369,9 @@ def test_the_commands_are_the_same_from_any_side(turn: Turn) -> None:
             state = state._replace(front_unequal_s=0.0, rear_unequal_s=0.0)
             # And the rear wheels alone are held to the slip of the others.
             tuned = tuned._replace(unequal_rear_slip_target=0.9)
+            if m.power_demand_w >= 0.0:
+                # And a driven front wheel alone is held to the slip of one with less of its motor.
+                m = m._replace(motor_gain=(m.motor_gain[0],) * 2 + (m.motor_gain[2],) * 2)
         command, after = law.step(m, state, tuned, scene.car, TABLE)
         other_command, other_after = law.step(turn.of(m), turn.of(state), turn.of(tuned), turn.car(scene.car), TABLE)
         if isinstance(turn, EndForEnd) and max(command.hold_nm, other_command.hold_nm) > 0.0:

@@ -168,22 +168,40 @@ def known_yaw(m, state, settings):
     return now
 
 
-def slip_targets(state, slips, speed, demand, believed, settings, vehicle):
-    """Slip the limiter steers each wheel to: less while left and right are braked unequally.
+def driven_slip_targets(slips, speed, gains, settings):
+    """The same while driving.
+
+    A front wheel beside one with a weaker motor follows that one's slip, the rear ones, if both slip and any motor is
+    weak, those of both front ones; down to what goes with the speed.
+    """
+    ratio = settings.yaw_speed_mps / max(speed, 0.06)
+    targets = [settings.slip_target] * 4
+    for wheel, other in ((0, 1), (1, 0)):
+        if gains[other] < gains[wheel]:
+            targets[wheel] = max(0.01 * ratio**2, slips[other])
+    if any(gain < 1.0 for gain in gains) and all(slip * speed > 0.3 for slip in slips[2:]):
+        least = settings.unequal_rear_slip_target * (ratio if ratio > 1.0 else ratio**2)
+        targets[2:] = [max(least, min(slips[:2]))] * 2
+    return [min(target, settings.slip_target) for target in targets]
+
+
+def slip_targets(state, slips, speed, demand, gains, believed, settings, vehicle):
+    """Slip the limiter steers each wheel to: less while left and right are braked unequally, or a motor is weak.
 
     Less of that where a yaw rate is believed. Else, faster than 10 m/s, rear wheels that slip follow the front ones,
     if those have brakes and no more than 4 m/s2 are asked for.
     """
-    braking = demand < 0.0
+    if demand >= 0.0:
+        return driven_slip_targets(slips, speed, gains, settings)
     unequal = state.front_unequal_s
-    if not braking or -0.03 <= unequal <= 0.03:
+    if -0.03 <= unequal <= 0.03:
         front = rear = settings.slip_target
         whole = vehicle.front.friction_brake.max_torque_nm > 0.0 and not any(
             gain < 1.0 for gain in state.motion.brake_gain[:2]
         )
         both_slip = all(-slip * speed > 0.3 for slip in slips[2:])
         gentle = demand >= -4.0 * vehicle.chassis.mass_kg * speed
-        if braking and gentle and not unequal and whole and both_slip and 2.0 * speed > settings.yaw_speed_mps:
+        if gentle and not unequal and whole and both_slip and 2.0 * speed > settings.yaw_speed_mps:
             allowed = settings.unequal_rear_slip_target * max(settings.yaw_speed_mps / speed, 1.0)
             rear = min(rear, max(allowed, min(-slip for slip in slips[:2])))
         return [front, front, rear, rear]
@@ -255,6 +273,8 @@ class Wheel:
     axle: object
     before: t.WheelState
     target: float
+    gain: float
+    stuck: float
     gated: bool = False
     doubtful: bool = False  # so near to its edge that rounding decides
     slip: float = 0.0
@@ -310,11 +330,11 @@ def step(m, state, settings, vehicle, decide):
         radius = (vehicle.front if i < 2 else vehicle.rear).wheel.radius_m
         now = slip(speed, m.speed_mps, radius, settings.slip_speed_floor_mps)
         slips.append(now if first else low_pass(before.slip, now, m.dt_s, settings.slip_filter_s))
-    targets = slip_targets(state, slips, m.speed_mps, m.power_demand_w, yaw.believed, settings, vehicle)
+    targets = slip_targets(state, slips, m.speed_mps, m.power_demand_w, m.motor_gain, yaw.believed, settings, vehicle)
     standing = braking and m.speed_mps < settings.slip_speed_floor_mps
     wheels = [
-        Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i], targets[i], slip=slips[i])
-        for i, speed in enumerate(m.wheel_speed_radps)
+        Wheel(speed, vehicle.front if i < 2 else vehicle.rear, state.wheels[i], targets[i], *gains, slip=slips[i])
+        for i, (speed, *gains) in enumerate(zip(m.wheel_speed_radps, m.motor_gain, m.motor_stuck_nm, strict=True))
     ]
     front, rear = axles = [
         Pair(
@@ -362,9 +382,10 @@ def step(m, state, settings, vehicle, decide):
             held = max(m.speed_mps * (1.0 - settings.critical_slip), floor) / wheel.axle.wheel.radius_m
             turning = min(wheel.speed, 1.12 * m.speed_mps / wheel.axle.wheel.radius_m) if braking else wheel.speed
             wheel.conversion = max(turning, held)
-            weakest = regeneration_limit(wheel.fast, m.speed_mps, wheel.before.heat, wheel.axle.motor)
+            weakest = wheel.gain * regeneration_limit(wheel.fast, m.speed_mps, wheel.before.heat, wheel.axle.motor)
             brake = wheel.axle.friction_brake.max_torque_nm or weakest
-            wheel.room = brake if braking else torque_limit(wheel.fast, wheel.before.heat, wheel.axle.motor)
+            strongest = wheel.gain * torque_limit(wheel.fast, wheel.before.heat, wheel.axle.motor)
+            wheel.room = brake if braking else strongest
             if settings.gate_mode == GATE_MODE_LIMITER:
                 wheel.grip = grip(braking, wheel.road, wheel.speed, m.speed_mps, wheel.target, settings, wheel.axle)
                 wheel.gated |= keeps_slip(braking, wheels, i, m, state.wheels, settings, vehicle)
@@ -408,7 +429,8 @@ def step(m, state, settings, vehicle, decide):
         wheel.motor *= factor
         if braking and not wheel.gated:
             # Whatever the motor does, wheel and brake together brake as asked.
-            wheel.friction = -min(max(wheel.motor - wheel.total, 0.0), wheel.axle.friction_brake.max_torque_nm)
+            delivered = wheel.gain * wheel.motor + wheel.stuck
+            wheel.friction = -min(max(delivered - wheel.total, 0.0), wheel.axle.friction_brake.max_torque_nm)
     return axles, share, decided, bits
 
 
@@ -425,14 +447,16 @@ def _torque(wheel, short, braking, m, settings, bits):
             if wheel.room < torque_limit(wheel.fast, 0.0, motor):
                 bits.add(t.LIMIT_THERMAL)
     weakest = regeneration_limit(wheel.fast, m.speed_mps, heat, motor)
-    wanted = max(wheel.total, -weakest) if braking else wheel.total
+    wanted = max(wheel.total, -wheel.gain * weakest) if braking else wheel.total
     if wanted > wheel.total:
         bits.add(t.LIMIT_REGENERATION)
     strongest = torque_limit(wheel.fast, heat, motor)
+    # A motor that gives a part is commanded the more, and one that gives nothing nothing.
+    wanted, grip = (x / wheel.gain if wheel.gain else 0.0 for x in (wanted, wheel.grip))
     if braking:
-        weakest = min(weakest, wheel.grip)
+        weakest = min(weakest, grip)
     else:
-        strongest = min(strongest, wheel.grip)
+        strongest = min(strongest, grip)
     way = slewed(
         wheel.before.motor_nm,
         wanted,
@@ -441,7 +465,7 @@ def _torque(wheel, short, braking, m, settings, bits):
         settings.slew_down_nmps,
         settings.slew_regeneration_nmps,
     )
-    wheel.motor = 0.0 if wheel.gated else min(max(way, -weakest), strongest)
+    wheel.motor = 0.0 if wheel.gated or not wheel.gain else min(max(way, -weakest), strongest)
     if abs(wheel.motor) <= NOTHING:
         wheel.motor = 0.0
     if abs(wheel.motor - wanted) > NOTHING:
