@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iwm_power_manager.control import strategies
-from iwm_power_manager.control.budget import Used
+from iwm_power_manager.control.budget import Used, affordable
 from iwm_power_manager.control.persistence import SAMPLES, no_jitter
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.split import decide
@@ -274,6 +275,40 @@ def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_
         for share, cost in splits.bellman((power, speed, 0.0, 0.0), previous, table, outcome, steps=steps).items():
             total[share] += weight * cost
     assert within_rounding(total, ours, 1e-6)
+
+
+@settings(max_examples=60)
+@given(st.lists(POWER, min_size=4, max_size=4), st.floats(2.0, 35.0), SHARE, st.sampled_from([0.2, 0.9]))
+def test_with_a_budget_a_change_has_to_be_worth_more_than_the_mean_over_noise_is_uncertain(
+    demands, speed, previous, friction
+):
+    gain = 0.5
+    jitter = no_jitter()._replace(samples_w=(*demands[1:], *(0.0,) * 7), taken=3, gain=gain)
+    at = situation(demands[0], speed, previous=previous)._replace(jitter=jitter)
+    problem = TABLE.problem._replace(friction=friction)
+    table = BUDGETED._replace(problem=problem, discount=0.0)
+    ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, table)
+    weights = gain * (1.0 - gain) ** np.arange(4)
+    weights /= weights.sum()
+
+    def settled_j(power, share):
+        return step_cost_and_next(power, speed, 0.0, 0.0, share, CAR, problem).cost_j
+
+    step_j = splits.lagging(demands, weights, speed, settled_j, problem, CAR)
+    motors_w = full_power_w(speed, CAR)
+    steps = 0.2 / problem.dt_s + (0.5 + 0.4 / problem.dt_s if demands[0] > -motors_w else 1.0)
+    costs = {}
+    for share in (previous, *table.share):
+        if not affordable(share, previous, Used(0.0, 0.0), 8.0):
+            continue
+        saved = np.array([settled_j(power, previous) - settled_j(power, share) for power in demands])
+        chance = math.sqrt(np.average((saved - weights @ saved) ** 2, weights=weights) * (weights @ weights))
+        mean = sum(weight * step_j(power, share) for weight, power in zip(weights, demands, strict=True))
+        changed = table.switching_cost_j * splits.price_units(share - previous)
+        changed += table.switching_fixed_cost_j * (share != previous)
+        costs.setdefault(share, steps * (mean + chance) + changed)
+    costs[previous] -= splits.TELLS_APART_W * problem.dt_s
+    assert within_rounding(costs, ours, 1e-6)
 
 
 @pytest.mark.parametrize("k", range(SAMPLES))

@@ -3,11 +3,12 @@
 
 It minimises the cost of the next step plus the expected cost of all that follows: no rounding to grid points. A change
 costs what the budget of changes makes it (`control.budget`); what would have to come for it to pay is believed by half
-only, and what is noise of the demand is averaged out (`control.persistence`).
+only, and what is noise of the demand is averaged out (`control.persistence`), as far as a mean can.
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from iwm_power_manager.control.budget import affordable, price_factor, price_level, price_units
@@ -78,13 +79,15 @@ def _ahead(
 class _Sample(NamedTuple):
     """A demand that counts, and what of it is the same for all shares.
 
-    `rolling` is as `ahead.settled` if no wheel slipped; `followed` is the part of its slip that wheels reach.
+    `rolling` is as `ahead.settled` if no wheel slipped; `followed` is the part of its slip that wheels reach. `kept_j`
+    is what a step at the share that is held costs.
     """
 
     demand_w: float
     ahead: _Ahead
     rolling: Settled
     followed: float
+    kept_j: float
 
 
 @kernel
@@ -93,7 +96,9 @@ def _sample(power_demand_w: float, situation: Situation, vehicle: VehicleParams,
     ahead = _ahead(power_demand_w, power_demand_w, situation, vehicle, policy)
     rolling = settled(power_demand_w, speed, False, vehicle, problem)
     followed = slip_followed(ahead.settled.force_n, speed, SAMPLE_S, vehicle, problem)
-    return _Sample(power_demand_w, ahead, rolling, followed)
+    front, rear, kept = situation.front_slip, situation.rear_slip, situation.previous_share
+    kept_j = step_cost_and_next(power_demand_w, speed, front, rear, kept, vehicle, problem).cost_j
+    return _Sample(power_demand_w, ahead, rolling, followed, kept_j)
 
 
 @kernel
@@ -142,11 +147,13 @@ class _Outlook(NamedTuple):
     """What a share costs in a step of the chain, and what is forecast to follow, J.
 
     `later_j` goes by the present demand, `earlier_j` by that of a step ago, where it counts; else they are the same.
+    Where the demand jitters, `doubt_j` is the standard error of what a step saves against the share that is held.
     """
 
     step_j: float
     later_j: float
     earlier_j: float
+    doubt_j: float
 
 
 @kernel
@@ -169,13 +176,13 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
         trust = TRUST
         steps = TRUST + (1.0 - TRUST) * WORTH_S / policy.problem.dt_s + held
     ahead = _ahead(demand_w, earlier_w, situation, vehicle, policy)
-    now = _Sample(demand_w, ahead, ahead.settled, 1.0)
+    now = _Sample(demand_w, ahead, ahead.settled, 1.0, 0.0)
     seen: tuple[_Sample, ...] = (now, now, now, now, now, now, now, now, now, now, now, now)
     if gain <= _LASTING:
         seen = _jittering(situation, vehicle, policy)
     # Each kernel is called in one place, so that the compiler puts it there: a car and a policy are much to pass on.
     best, most = previous, 0.0
-    kept = found = _Outlook(0.0, 0.0, 0.0)
+    kept = found = _Outlook(0.0, 0.0, 0.0, 0.0)
     worth = 0.0
     for k in range(-1, policy.share.size):
         share, switching = previous, LEAST_DIFFERENCE_W * policy.problem.dt_s
@@ -200,7 +207,7 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
             worth = steps * step + trust * 0.5 * (later + earlier)
             if steady and step > 0.0:
                 worth = max(worth, step + min(later, earlier))
-            worth -= switching
+            worth -= switching + (steps * found.doubt_j if budgeted else 0.0)
             if worth + _ROUNDING * abs(kept.step_j) <= most:
                 break
         if k >= 0 and worth > most:
@@ -229,7 +236,7 @@ def _outlook(
     speed, problem, gain = situation.speed_mps, policy.problem, situation.jitter.gain
     samples = min(SAMPLES, situation.jitter.taken) if gain <= _LASTING else 0
     lags = problem.slip_model == SLIP_QUASI_STEADY
-    step = later = earlier = weights = unfollowed = 0.0
+    step = later = earlier = weights = unfollowed = saved = squares = spread = 0.0
     weight = gain
     for i in range(samples + 2 if lags else samples + 1):
         sample = seen[i if i <= samples else SAMPLES + 1]
@@ -252,10 +259,16 @@ def _outlook(
         later += weight * one.later_j
         earlier += weight * one.earlier_j
         weights += weight
+        saving = sample.kept_j - one.step_j
+        saved += weight * saving
+        squares += weight * saving * saving
+        spread += weight * weight
         weight *= 1.0 - gain
+    saved /= weights
+    doubt = 0.0 if least else math.sqrt(max(squares / weights - saved * saved, 0.0) * spread) / weights
     if bound:
-        return _Outlook(step / weights, found.later_j, found.earlier_j)
-    return _Outlook(step / weights, later / weights, earlier / weights)
+        return _Outlook(step / weights, found.later_j, found.earlier_j, doubt)
+    return _Outlook(step / weights, later / weights, earlier / weights, doubt)
 
 
 @kernel
@@ -282,7 +295,7 @@ def _demand_outlook(
     if problem.slip_model == SLIP_QUASI_STEADY:
         outcome = settled_step(ahead.settled, power_demand_w, speed, share, True, least, vehicle, problem)
         if bound:
-            return _Outlook(outcome.cost_j, found.later_j, found.earlier_j)
+            return _Outlook(outcome.cost_j, found.later_j, found.earlier_j, 0.0)
     else:
         outcome = step_cost_and_next(
             power_demand_w, speed, situation.front_slip, situation.rear_slip, share, vehicle, problem
@@ -302,7 +315,7 @@ def _demand_outlook(
         if ahead.earlier != ahead.power:
             expected = _expected_j(ahead.earlier, end, c, d, cell, level, policy)
         earlier += weight * expected
-    return _Outlook(outcome.cost_j, later, earlier)
+    return _Outlook(outcome.cost_j, later, earlier, 0.0)
 
 
 @kernel
