@@ -158,7 +158,7 @@ def estimate(
     """
     shown = measurement.speed_mps
     dt = measurement.dt_s
-    raw = measurement.wheel_speed_radps
+    raw, shift = measurement.wheel_speed_radps, measurement.torque_shift_nm
     if first:
         before = started_motion(shown, rims_of(raw, vehicle))
     factor, calm_s = before.wheels_factor, 0.0
@@ -180,7 +180,7 @@ def estimate(
         before = restarted_motion(mean, rims, agreed, shown, wheels, turning, before, vehicle)
         agreed = before.agreed
     stray, doubt = wheel_doubts(
-        w, turning, predicted, acceleration, dt, before.wheel_stray_s, before.wheel_doubt_s, vehicle
+        w, turning, shift, predicted, acceleration, dt, before.wheel_stray_s, before.wheel_doubt_s, vehicle
     )
     rolling = rolling_of(rims, doubt, turning)
     sensor = judged_speed(shown, predicted, acceleration, dt, before, rolling)

@@ -131,6 +131,7 @@ def _wheel_doubt(
     speed_radps: float,
     change_radps: float,
     torque_nm: float,
+    shift_nm: float,
     reference_mps: float,
     acceleration_mps2: float,
     dt_s: float,
@@ -147,14 +148,16 @@ def _wheel_doubt(
     level = direction * (radius * speed_radps - reference_mps)
     change = direction * change_radps
     explained = direction * torque_nm / inertia * dt_s
+    # Where a stamp looks older than it is, the last torque explains more than the one that was looked up by it.
+    last = direction * (torque_nm - shift_nm) / inertia * dt_s
     rolling = direction * acceleration_mps2 / radius * dt_s
     jumped = False
     if size > SLOW_MPS:
         # The road only ever drives a wheel towards the car's speed.
         if level < 0.0:
-            jumped = change < TORQUE_MARGIN * min(explained, rolling, 0.0) - JUMP_RADPS
+            jumped = change < TORQUE_MARGIN * min(explained, last, rolling, 0.0) - JUMP_RADPS
         else:
-            jumped = change > TORQUE_MARGIN * max(explained, rolling, 0.0) + JUMP_RADPS
+            jumped = change > TORQUE_MARGIN * max(explained, last, rolling, 0.0) + JUMP_RADPS
     # Nothing holds a wheel that is free, nor one that is braked and yet faster than the car.
     free = abs(torque_nm) < FREE_PART * load_nm
     against = direction * torque_nm * level < 0.0 and not free
@@ -180,6 +183,7 @@ def _wheel_doubt(
 def wheel_doubts(
     w: Wheels,
     t: Turning,
+    shift_nm: Wheels,
     predicted: float,
     acceleration: float,
     dt: float,
@@ -189,18 +193,18 @@ def wheel_doubts(
 ) -> tuple[Wheels, Wheels]:
     """How long each wheel has stayed away by now, and the time it has yet to be good."""
     front, rear = vehicle.front.wheel, vehicle.rear.wheel
-    torque, change, g = t.torque_nm, t.change_radps, t.gated
+    torque, change, g, shift = t.torque_nm, t.change_radps, t.gated, shift_nm
     s0, d0 = _wheel_doubt(
-        w[0], change[0], torque[0], predicted, acceleration, dt, stray[0], old[0], g[0], front, t.front_nm
+        w[0], change[0], torque[0], shift[0], predicted, acceleration, dt, stray[0], old[0], g[0], front, t.front_nm
     )
     s1, d1 = _wheel_doubt(
-        w[1], change[1], torque[1], predicted, acceleration, dt, stray[1], old[1], g[1], front, t.front_nm
+        w[1], change[1], torque[1], shift[1], predicted, acceleration, dt, stray[1], old[1], g[1], front, t.front_nm
     )
     s2, d2 = _wheel_doubt(
-        w[2], change[2], torque[2], predicted, acceleration, dt, stray[2], old[2], g[2], rear, t.rear_nm
+        w[2], change[2], torque[2], shift[2], predicted, acceleration, dt, stray[2], old[2], g[2], rear, t.rear_nm
     )
     s3, d3 = _wheel_doubt(
-        w[3], change[3], torque[3], predicted, acceleration, dt, stray[3], old[3], g[3], rear, t.rear_nm
+        w[3], change[3], torque[3], shift[3], predicted, acceleration, dt, stray[3], old[3], g[3], rear, t.rear_nm
     )
     return (s0, s1, s2, s3), (d0, d1, d2, d3)
 

@@ -43,12 +43,17 @@ def one(wheel, value, other):
     return tuple(value if i == wheel else other for i in range(4))
 
 
-def judged(wheel, off_mps, change_radps=0.0, gated=False, stray_s=0.0, doubt_s=0.0, speed=20.0):
+def judged(
+    wheel, off_mps, change_radps=0.0, gated=False, stray_s=0.0, doubt_s=0.0, speed=20.0, torque_nm=0.0, last_nm=None
+):
     """What is found of one wheel that is off while the others roll: time it has stayed away, time of its doubt."""
     w = one(wheel, (speed + off_mps) / RADIUS, speed / RADIUS)
     change = one(wheel, change_radps, 0.0)
-    turning = Turning(NONE, change, NONE, one(wheel, gated, False), LOAD_NM, LOAD_NM)
-    stray, doubt = wheel_doubts(w, turning, speed, 0.0, DT, one(wheel, stray_s, 0.0), one(wheel, doubt_s, 0.0), CAR)
+    turning = Turning(one(wheel, torque_nm, 0.0), change, NONE, one(wheel, gated, False), LOAD_NM, LOAD_NM)
+    shift = one(wheel, 0.0 if last_nm is None else torque_nm - last_nm, 0.0)
+    stray, doubt = wheel_doubts(
+        w, turning, shift, speed, 0.0, DT, one(wheel, stray_s, 0.0), one(wheel, doubt_s, 0.0), CAR
+    )
     assert [value for i, value in enumerate(stray + doubt) if i % 4 != wheel] == [0.0] * 6
     return stray[wheel], doubt[wheel]
 
@@ -63,6 +68,18 @@ def test_what_the_road_takes_from_a_wheel_is_its_torque_less_what_turns_it(wheel
     road = turning_of(speeds, wheels, travel, False, DT, NONE, car).road_nm
     inertia = (car.front if wheel < 2 else car.rear).wheel.inertia_kgm2
     assert road == pytest.approx(one(wheel, travel * (50.0 - inertia * 10.0), travel * 20.0))
+
+
+@WHEELS
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_change_is_explained_by_the_last_torque_too_and_by_no_more(wheel, sign):
+    """A stamp that looks too old belongs to a torque of before."""
+    inertia = (CAR.front if wheel < 2 else CAR.rear).wheel.inertia_kgm2
+    most = 1.5 * 400.0 / inertia * DT + JUMP_RADPS
+    given = {"torque_nm": sign * 50.0, "last_nm": sign * 400.0}
+    assert judged(wheel, sign * 3.0, sign * 0.98 * most, **given)[1] == 0.0
+    assert judged(wheel, sign * 3.0, sign * 1.02 * most, **given)[1] > 0.0
+    assert judged(wheel, sign * 3.0, sign * 0.98 * most, torque_nm=sign * 50.0)[1] > 0.0
 
 
 @WHEELS
