@@ -20,6 +20,8 @@ LATEST_S = 0.25
 _LEAST_PART = 0.5
 #: Where messages stay away for longer, what the road takes is not known any more.
 _SILENT_NS = 60_000_000
+#: Weights of a speed that is made of the newest message alone.
+ALONE = (1.0,)
 NO_SHIFT: Wheels = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -53,6 +55,7 @@ class Alignment:
         self._last_radps: Wheels | None = None
         self._since_ns, self._since_radps = 0, NO_SHIFT
         self._road_nm: Wheels | None = None
+        self._means: deque[Wheels] = deque()
         self._newest_ns = self._arrived_ns = 0
 
     def applied(self, now_ns: int, torque_nm: Wheels) -> None:
@@ -63,13 +66,16 @@ class Alignment:
         while len(torques) > 1 and torques[1][0] < now_ns - self._delay_ns - 2.0 * LATEST_S * _NS_PER_S:
             torques.popleft()
 
-    def shift_nm(self, now_ns: int, dt_s: float, stamp_ns: int, speed_radps: Wheels) -> Wheels:
+    def shift_nm(
+        self, now_ns: int, dt_s: float, stamp_ns: int, speed_radps: Wheels, weights: Sequence[float] = ALONE
+    ) -> Wheels:
         """What to add to the torques commanded last, to get those that explain how the wheels' speeds have changed.
 
         Parameters
         ----------
         now_ns, dt_s : of the step
         stamp_ns, speed_radps : of the newest wheel speeds
+        weights : of the newest messages that they are made of; each of several counts teeth since the one before it
 
         Returns
         -------
@@ -90,7 +96,7 @@ class Alignment:
             # After a gap in the messages nobody knows what the road took in it.
             self._since_ns, self._since_radps = stamp_ns, speed_radps
         elif since_s >= _LEAST_PART * dt_s:
-            mean = self._mean_nm(self._since_ns - self._delay_ns, stamp_ns - self._delay_ns)
+            mean = self._weighted_nm(self._since_ns - self._delay_ns, stamp_ns - self._delay_ns, weights)
             start = self._since_radps
             a, b, c, d = (mean[i] - inertia[i] * (speed_radps[i] - start[i]) / since_s for i in range(4))
             self._road_nm = road = a, b, c, d
@@ -100,18 +106,31 @@ class Alignment:
         a, b, c, d = (road[i] + inertia[i] * (speed_radps[i] - before[i]) / dt_s - last[i] for i in range(4))
         return a, b, c, d
 
+    def _weighted_nm(self, from_ns: int, to_ns: int, weights: Sequence[float]) -> Wheels:
+        """Mean of the torques by which a speed has changed that is made of several messages."""
+        if len(weights) == 1:
+            return self._mean_nm(from_ns, to_ns)
+        half_ns = (to_ns - from_ns) // 2
+        means = self._means
+        means.append(self._mean_nm(from_ns - half_ns, to_ns - half_ns))
+        while len(means) > len(weights):
+            means.popleft()
+        newest = weights[-len(means) :]
+        total = sum(newest)
+        a, b, c, d = (sum(w * mean[i] for w, mean in zip(newest, means, strict=True)) / total for i in range(4))
+        return a, b, c, d
+
     def _mean_nm(self, from_ns: int, to_ns: int) -> Wheels:
         """Mean of the torques that acted between two times; the first that is remembered stands for those before."""
-        total = [0.0, 0.0, 0.0, 0.0]
-        end = to_ns
+        a = b = c = d = 0.0
+        end, whole = to_ns, to_ns - from_ns
         for k in range(len(self._torques) - 1, -1, -1):
             begin_ns, torque = self._torques[k]
             begin = max(begin_ns, from_ns) if k else from_ns
             if begin < end:
-                part = (end - begin) / (to_ns - from_ns)
-                total = [t + part * nm for t, nm in zip(total, torque, strict=True)]
+                part = (end - begin) / whole
+                a, b, c, d = a + part * torque[0], b + part * torque[1], c + part * torque[2], d + part * torque[3]
                 end = begin
             if end <= from_ns:
                 break
-        a, b, c, d = total
         return a, b, c, d

@@ -16,7 +16,7 @@ from iwm_power_manager.control.alignment import LATEST_S, NO_SHIFT, Alignment, a
 from iwm_power_manager.control.execution import COMPILED, Execution
 from iwm_power_manager.control.guard import violated_bound
 from iwm_power_manager.control.inputs import WheelVerdict
-from iwm_power_manager.control.monitor import WHEELS, InputLimits, InputMonitor
+from iwm_power_manager.control.monitor import SPEED, WHEELS, InputLimits, InputMonitor
 from iwm_power_manager.control.motion import DOUBT_SPEED
 from iwm_power_manager.control.record import Watch, to_numbers
 from iwm_power_manager.control.settings import Settings
@@ -38,6 +38,8 @@ from iwm_power_manager.model.parameters import VehicleParams
 #: While a wheel is lost, slip is judged this much more strictly: its axle is watched through one wheel only. What the
 #: car slows down within the limiter's time constant, by which this trails its target, is to be as much less.
 LOST_WHEEL_SLIP_FACTOR = 0.75
+#: A speed is overdue after so many of the times that were between its last two; beyond so many s nobody waits for it.
+OVERDUE, LONGEST_WAIT_S = 2.0, 0.3
 #: Acceleration that motors are asked for which all seem dead, m/s2: no jolt if they come back, on ice either.
 TRIED_MPS2 = 0.6
 
@@ -170,7 +172,7 @@ class Controller:
         self._watch_motors(dt_s)
         self._follow_estimate()
         measurement = self._measurement(now_ns, dt_s)
-        settings = self._settings(age_s[1])
+        settings = self._settings(age_s[1] + self.monitor.wheels_behind_s)
         command, decided, assumed = self.execution.advance(
             measurement, self._before, self._after, settings, self._held_vehicle, self.policy
         )
@@ -209,17 +211,24 @@ class Controller:
         """Part of its friction torque that each brake seems to give."""
         return self.command.brake_gain if self.command else (1.0, 1.0, 1.0, 1.0)
 
+    def _is_due(self, now_ns: int) -> bool:
+        """Whether a speed, even if it counts as missing, is no older than its messages let expect."""
+        monitor = self.monitor
+        return monitor.tallies[SPEED].age_s(now_ns) <= OVERDUE * monitor.speed_interval_s <= LONGEST_WAIT_S
+
     def _measurement(self, now_ns: int, dt_s: float) -> Measurement:
         monitor, supervision = self.monitor, self.supervision
         speed = monitor.speed_mps
         wheels = monitor.wheel_speed_radps
         radius = self._vehicle.front.wheel.radius_m
-        if supervision.stale & STALE_SPEED and not supervision.stale & STALE_WHEELS:
+        # One that comes more rarely than it should is the last one in between.
+        lost = supervision.stale & STALE_SPEED and not self._is_due(now_ns)
+        if lost and not supervision.stale & STALE_WHEELS:
             # The wheel that slips least tells the speed best.
             speed = radius * (max(wheels, key=abs) if monitor.demand_w < 0.0 else min(wheels, key=abs))
         elif supervision.stale & STALE_WHEELS and not supervision.stale & STALE_SPEED:
             wheels = (speed / radius,) * 4
-        if supervision.stale & STALE_SPEED and not supervision.stale & STALE_DEMAND:
+        if lost and not supervision.stale & STALE_DEMAND:
             monitor.demand_speed_mps = speed  # the sensor's last one was not that of this demand
         demand = shape_demand(monitor.demand_w, monitor.demand_speed_mps, speed, supervision)
         gains, command = self.actuators.gains, self.command
@@ -231,7 +240,7 @@ class Controller:
         wheels_ns = monitor.tallies[WHEELS].accepted_ns
         shift = NO_SHIFT
         if self._limits.age_s and wheels_ns is not None and wheels is monitor.wheel_speed_radps:
-            shift = self._alignment.shift_nm(now_ns, dt_s, wheels_ns, wheels)
+            shift = self._alignment.shift_nm(now_ns, dt_s, wheels_ns, wheels, monitor.coarse.weights)
         discharge, charge = self.execution.battery_limits(monitor.soc, monitor.temperature_c, self._held_vehicle)
         factor = supervision.motor_factor
         return Measurement(

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from iwm_power_manager.control.coarse import Coarse
 from iwm_power_manager.control.inputs import (
     NEW_WHEELS,
     Rival,
@@ -211,8 +212,11 @@ class InputMonitor:
     Attributes
     ----------
     speed_mps, wheel_speed_radps, demand_w, soc, temperature_c, friction : last accepted values
+    speed_interval_s : between the last two accepted speeds; 0 before
     demand_speed_mps : speed of the car when the last demand was accepted
     direction : the driver asks for, 1 forwards, -1 reverse
+    coarse : smooths wheel speeds that come in coarse steps
+    wheels_behind_s : how much older than its stamp that makes them
     verdicts : what was wrong with each wheel in the last `wheel_states`
     wheels_refused : how often a wheel was not believed, by its name and why
     motor_torque_nm : torques the motors reported since `collect_torques` was called last, NaN for each that did not
@@ -231,6 +235,7 @@ class InputMonitor:
     def forget(self) -> None:
         """Start again without history, as at activation; counters stay."""
         self.speed_mps = 0.0
+        self.speed_interval_s = 0.0
         self.wheel_speed_radps: Wheels = (0.0, 0.0, 0.0, 0.0)
         self.demand_w = 0.0
         self.direction = 1.0
@@ -242,6 +247,8 @@ class InputMonitor:
         self.motor_torque_nm: Wheels | None = None
         self._motion: dict[str, tuple[float, int]] = {}
         self._wheel_memory = NEW_WHEELS
+        self.coarse = Coarse()
+        self.wheels_behind_s = 0.0
         self.forget_times()
 
     def forget_times(self) -> None:
@@ -297,8 +304,10 @@ class InputMonitor:
             told = self._shown_by_wheels(reading.stamp_ns)
             farther = abs(reading.speed_mps - told) >= abs(self.speed_mps - told)  # never so where nobody tells
             violation = violation if farther else self._believe_rival(SPEED)
+        interval_s = tally.age_s(reading.stamp_ns)
         if tally.note(violation, reading.stamp_ns):
             self.speed_mps = reading.speed_mps
+            self.speed_interval_s = 0.0 if math.isinf(interval_s) else interval_s
             return True
         return False
 
@@ -316,8 +325,14 @@ class InputMonitor:
             return tally.note(violation, reading.stamp_ns)
         elapsed_s = 0.0 if self._wheels_ns is None else max(reading.stamp_ns - self._wheels_ns, 0) / _NS_PER_S
         self._wheels_ns = reading.stamp_ns
+        shown = select_by_name(reading, self._wheel_names)
+        if self._limits.stamp:
+            a, b, c, d = shown
+            shown = self.coarse.smoothed((a, b, c, d))
+            weights = self.coarse.weights
+            self.wheels_behind_s = 0.5 * len(weights) * elapsed_s if len(weights) > 1 else 0.0
         judged = judge_wheels(
-            select_by_name(reading, self._wheel_names),
+            shown,
             self.speed_mps / self._limits.radius_m,
             elapsed_s,
             self._wheel_memory,

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iwm_power_manager.control.alignment import LATEST_S, NO_SHIFT, Alignment, arrived_nm
+from iwm_power_manager.control.coarse import line_weights
 from iwm_power_manager.control.execution import braked
 from iwm_power_manager.control.types import Measurement
 from iwm_power_manager.share import share_path
@@ -80,6 +81,28 @@ def test_speeds_that_are_nearly_of_one_time_tell_no_torque() -> None:
     turned = Turned([-100.0] * 30, -60.0)
     roads = shifted(turned, [0, 10, 11, 12, 30])
     assert roads == [pytest.approx(turned.roads)] * 4
+
+
+@given(torques=st.lists(st.floats(-600.0, 200.0), min_size=40, max_size=40), road=st.floats(-150.0, 0.0))
+def test_of_wheels_that_count_teeth_torques_are_weighted_as_their_counts(torques, road) -> None:
+    """What is shown is the mean speed between two messages, of several of them: the road is found all the same."""
+    turned, weights = Turned(torques, road), line_weights(5)
+    ms = [turned.speeds(t) for t in range(0, 400, 5)]
+    counted = [
+        tuple((a + 4.0 * b + c) / 6.0 for a, b, c in zip(ms[2 * k - 2], ms[2 * k - 1], ms[2 * k], strict=True))
+        for k in range(1, 40)
+    ]
+    alignment, before = Alignment(INERTIA, 0.0), None
+    for k in range(5, 39):
+        shown = tuple(sum(w * counted[k - 4 + i][n] for i, w in enumerate(weights)) for n in range(4))
+        now = 10 * (k + 1)
+        shift = alignment.shift_nm(now * MS, 0.01, now * MS, shown, weights)
+        if before is not None and k > 12:
+            last = turned.torque(k)
+            found = [last[n] + shift[n] - INERTIA[n] * (shown[n] - before[n]) / 0.01 for n in range(4)]
+            assert found == pytest.approx(turned.roads, abs=2.0)
+        alignment.applied(now * MS, turned.torque(k + 1))
+        before = shown
 
 
 @pytest.mark.parametrize("late", [1000, -50])

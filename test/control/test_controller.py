@@ -259,6 +259,19 @@ class TestStandIns:
         values = drive.run(10, wheels=self.WHEELS, demand=demand, without=("speed",))
         assert values["speed_mps"] == RADIUS * wheel
 
+    @pytest.mark.parametrize(("every", "held_s"), [(5, 0.1), (10, 0.2), (15, 0.3), (16, 0.0), (2, 0.04)])
+    def test_a_speed_that_comes_rarely_is_the_last_one_in_between(self, drive, every, held_s) -> None:
+        """It is missing, and lost after twice as long as it took before; beyond 0.15 s at once."""
+        for _ in range(6):
+            drive.run(1, demand=-4000.0)
+            drive.run(every - 1, demand=-4000.0, wheels=(30.0,) * 4, without=("speed",))
+        drive.run(1, demand=-4000.0)
+        for _ in range(40):
+            values = drive.run(1, demand=-4000.0, wheels=(30.0,) * 4, without=("speed",))
+            age_s = values["vehicle_speed_age_s"]
+            assert (values["stale"] == STALE_SPEED) == (age_s > 0.03)
+            assert values["speed_mps"] == (10.0 if age_s <= max(held_s, 0.03) else RADIUS * 30.0), age_s
+
     @pytest.mark.parametrize(("wheel", "speed"), [(0.5, 0.5 * RADIUS), (-0.5, -0.5 * RADIUS)])
     def test_a_car_that_stands_or_rolls_back_a_little_is_seen_as_it_is(self, drive, wheel, speed) -> None:
         drive.run(60, speed=0.0)
@@ -273,6 +286,16 @@ class TestLateWheels:
         ages = [values[f"{name}_age_s"] for name in ("vehicle_speed", "wheel_states", "battery_state")]
         assert ages == pytest.approx([0.01, 0.03, 0.02])
         assert values["setting.slip_limiter_s"] == default_settings("equal").slip_limiter_s + ages[1]
+
+    def test_it_is_slower_by_what_smoothing_takes(self, drive) -> None:
+        """Wheels that count teeth: one or two of them more or less in each message."""
+        step = 2.0 * math.pi / 48 / DT
+        for k in range(60):
+            values = drive.run(1, wheels=tuple(step * (2 + (k * 0.7 + 0.3 * i) % 1.0 // 0.6) for i in range(4)))
+        count = len(drive.controller.monitor.coarse.weights)
+        assert count > 1
+        base_s = default_settings("equal").slip_limiter_s + values["wheel_states_age_s"]
+        assert values["setting.slip_limiter_s"] == pytest.approx(base_s + 0.5 * count * DT)
 
     def test_what_the_road_takes_is_told_by_each_wheels_own_inertia(self) -> None:
         """Without torque, wheels that lose a radian a second in each step are braked by the road."""
