@@ -29,9 +29,9 @@ def arrived_nm(command: Command, measurement: Measurement) -> Wheels:
     """Torque at each wheel by a command, as far as motors and brakes are known, N m, forwards positive."""
     gain, stuck, brakes = measurement.motor_gain, measurement.motor_stuck_nm, command.brake_gain
     motor, friction, turning = command.motor_torque_nm, command.friction_torque_nm, measurement.wheel_speed_radps
-    a, b, c, d = (
+    a, b, c, d = [
         gain[i] * motor[i] + stuck[i] + (brakes[i] if turning[i] >= 0.0 else -brakes[i]) * friction[i] for i in range(4)
-    )
+    ]
     return a, b, c, d
 
 
@@ -98,12 +98,12 @@ class Alignment:
         elif since_s >= _LEAST_PART * dt_s:
             mean = self._weighted_nm(self._since_ns - self._delay_ns, stamp_ns - self._delay_ns, weights)
             start = self._since_radps
-            a, b, c, d = (mean[i] - inertia[i] * (speed_radps[i] - start[i]) / since_s for i in range(4))
+            a, b, c, d = [mean[i] - inertia[i] * (speed_radps[i] - start[i]) / since_s for i in range(4)]
             self._road_nm = road = a, b, c, d
             self._since_ns, self._since_radps = stamp_ns, speed_radps
         if road is None or now_ns - self._arrived_ns > _SILENT_NS:
             return NO_SHIFT
-        a, b, c, d = (road[i] + inertia[i] * (speed_radps[i] - before[i]) / dt_s - last[i] for i in range(4))
+        a, b, c, d = [road[i] + inertia[i] * (speed_radps[i] - before[i]) / dt_s - last[i] for i in range(4)]
         return a, b, c, d
 
     def _weighted_nm(self, from_ns: int, to_ns: int, weights: Sequence[float]) -> Wheels:
