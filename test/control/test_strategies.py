@@ -411,13 +411,13 @@ def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_
     free = dearest(0.0, 0.0)
     lasting, minute = [
         [dearest(each, 0.0) for each in (4.0, 19.0, 36.0, 40.0)],
-        [dearest(0.0, each) for each in (2.0, 4.0, 7.0, 10.0)],
+        [dearest(0.0, each) for each in (4.0, 9.0, 16.0, 20.0)],
     ]
     for prices_at in (lasting, minute):
         assert free > prices_at[0] > prices_at[1] > prices_at[2] > prices_at[3] == 0.0
     # Half of what a bucket of five minutes' budget holds: hardly dearer.
     assert free / lasting[1] == pytest.approx(2.0**0.5 * (1.0 + np.pi / (0.7 * 38.0)), rel=0.05)
-    assert free / minute[1] == pytest.approx(1.0 + np.pi / (0.7 * 8.0), rel=0.05)
+    assert free / minute[1] == pytest.approx(1.0 + np.pi / (0.7 * 18.0), rel=0.05)
 
 
 def test_the_way_back_to_the_middle_gets_dearer_by_what_was_used_before_the_way_there():
@@ -433,7 +433,7 @@ def test_the_way_back_to_the_middle_gets_dearer_by_what_was_used_before_the_way_
             (p for p in prices if lookahead_share(*state, table._replace(switching_cost_j=p)) != 1.0), default=0.0
         )
 
-    assert dearest(1.0) / dearest(5.0) == pytest.approx(1.0 + np.pi / (0.7 * 8.0), rel=0.05)
+    assert dearest(1.0) / dearest(10.0) == pytest.approx(1.0 + np.pi / (0.7 * 18.0), rel=0.05)
 
 
 def test_no_load_is_moved_off_an_axle_for_slip_that_a_jitter_does_not_reach():
