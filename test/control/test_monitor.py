@@ -240,6 +240,15 @@ class TestSpeed:
 
 
 class TestWheels:
+    @pytest.mark.parametrize("by_clock", [True, False])
+    def test_wheels_that_count_teeth_are_smoothed_where_stamps_say_when_and_not_in_lockstep(self, by_clock) -> None:
+        monitor = InputMonitor(NAMES, LIMITS if by_clock else LIMITS._replace(stamp=None))
+        for k in range(60):
+            stamp, counted = NOW + 10 * k * MS, tuple(5.0 * (4 + (0.4 * k + 0.2 * i) % 1.0 // 0.6) for i in range(4))
+            assert monitor.take_wheels(wheels(stamp, counted), stamp)
+        assert (monitor.wheel_speed_radps == counted) == (not by_clock)
+        assert monitor.wheels_behind_s == pytest.approx(0.005 * len(monitor.coarse.weights) if by_clock else 0.0)
+
     def test_wheels_are_matched_by_name(self, monitor) -> None:
         shuffled = ("rear_right", "front_left", "rear_left", "front_right")
         assert monitor.take_wheels(wheels(NOW, (4.0, 1.0, 3.0, 2.0), shuffled), NOW)
