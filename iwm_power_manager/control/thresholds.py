@@ -97,9 +97,9 @@ class Thresholds:
     motor_lag_s: float = _threshold(
         0.06, "s", 0.0, 1.0, "a reported motor torque may belong to any command of this time"
     )
-    # Of what nobody knows of motors, brakes and stamps, the middle: some ms to either side change nothing.
+    # Nobody knows it of motors, brakes and stamps: too long by 3 ms it lets torques swing, too short by 5 it does not.
     actuator_delay_s: float = _threshold(
-        0.003, "s", 0.0, 0.2, "time after which a command is a torque at the wheel, of motors and brakes"
+        0.002, "s", 0.0, 0.2, "time after which a command is a torque at the wheel, of motors and brakes"
     )
     motor_confirm_s: float = _threshold(
         0.1, "s", 0.01, 60.0, "a motor whose reports differ for longer is weak, dead, stuck or reversed"

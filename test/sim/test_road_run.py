@@ -17,8 +17,9 @@ from iwm_sim import road_run
 from iwm_sim.closed_loop import RoadRow
 from iwm_sim.drive import Drive
 from iwm_sim.faults import Fault
+from iwm_sim.road_measures import driven
 from iwm_sim.road_report import text
-from iwm_sim.scenario import Bound, Demand, Friction, Scenario
+from iwm_sim.scenario import Bound, Demand, Friction, Scenario, load_scenario
 
 CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml"))
 EQUAL = default_settings("equal")
@@ -130,15 +131,24 @@ def test_a_late_message_tells_the_power_manager_its_age_unless_its_stamp_lies():
 
 
 def test_what_arrives_without_a_delay_gives_the_same_bits_and_20_ms_later_others():
-    def driven(**wrong):
+    def series(**wrong):
         faults = tuple(Fault(t, kind, value, 0.0, 99.0, message=True) for t in INPUTS for kind, value in wrong.items())
         return drive(dataclasses.replace(STOP, faults=faults, imu=True, duration_s=1.0)).series
 
-    plain = driven()
-    np.testing.assert_array_equal(driven(delay_s=0.0, jitter_s=0.0, stamp_error_s=0.0, rate_hz=100.0), plain)
-    late = driven(delay_s=0.02, jitter_s=0.005)
+    plain = series()
+    np.testing.assert_array_equal(series(delay_s=0.0, jitter_s=0.0, stamp_error_s=0.0, rate_hz=100.0), plain)
+    late = series(delay_s=0.02, jitter_s=0.005)
     assert not np.array_equal(late, plain)
-    np.testing.assert_array_equal(driven(delay_s=0.02, jitter_s=0.005), late)
+    np.testing.assert_array_equal(series(delay_s=0.02, jitter_s=0.005), late)
+
+
+@pytest.mark.parametrize("road", ["stop_02", "stop_09", "split_stop", "split_stop_imu"])
+def test_in_a_stop_at_the_limit_torques_do_not_swing(road):
+    scenario = load_scenario(road)
+    run = driven(road_run.drive_scenario(scenario), scenario.truth)
+    there = np.diff(run.wheels("motor_{}_nm") + run.wheels("friction_{}_nm"), axis=0)
+    back_and_forth = (there[1:] * there[:-1] < 0.0) & (np.abs(there[1:] - there[:-1]) > 100.0)
+    assert back_and_forth.mean(axis=0).max() < 0.05
 
 
 def test_requirements_are_checked_and_said():
