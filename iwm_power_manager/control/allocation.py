@@ -34,7 +34,7 @@ from iwm_power_manager.control.types import (
     Wheels,
 )
 from iwm_power_manager.control.wheel import wheel_after, wheel_slip
-from iwm_power_manager.control.yaw import YawState, with_yaw, yaw_step
+from iwm_power_manager.control.yaw import GROWTH_FRICTION, YawState, with_yaw, yaw_step
 from iwm_power_manager.jit import kernel
 from iwm_power_manager.model.gate import gated_split
 from iwm_power_manager.model.limits import wheels_power_w, wheels_scale
@@ -75,7 +75,8 @@ def drive(
     s = settings
     front_s, rear_s = state.front_unequal_s, state.rear_unequal_s
     lasting_s = front_s if abs(front_s) > UNEQUAL_S else 0.0
-    growth = speed_part(speed, s) * s.yaw_rate_growth_nmps
+    firm = max(state.friction.left.friction, state.friction.right.friction) / GROWTH_FRICTION
+    growth = min(speed_part(speed, s), 1.0) * firm * s.yaw_rate_growth_nmps
     rate, lateral = measurement.yaw_rate_radps, measurement.lateral_mps2
     yaw = yaw_step(state.yaw, rate, lateral, speed, lasting_s, growth, braking, dt)
 

@@ -2,7 +2,7 @@
 """What a yaw rate adds to the yaw budget of wheels that brake unequally.
 
 Without one, the budget grows at a rate that any driver can steer against. A gyroscope shows how well he does: as long
-as the car hardly turns towards the side with more grip, more of that grip can be used; where it does turn, less, at
+as the car hardly turns, more of the grip of the better side can be used; where it turns towards that side, less, at
 once. The rate counts relative to what it was before, so that neither a bend nor a bias of the sensor does. It is
 believed where, by it, the car has first turned as unequal brakes turn a car: a sensor that stands still, or has its
 sign wrong, does not show that. One that later shows the car turning off to the other side is not believed any more.
@@ -10,7 +10,7 @@ sign wrong, does not show that. One that later shows the car turning off to the 
 No gyroscope is trusted alone: it takes an accelerometer that feels what the car does to the side, which is the change
 of its lateral speed and speed times yaw rate. The yaw rate counts within what is felt; and where what they differ by
 adds up to a lateral speed that no car has which still follows its wheels, neither is believed. Without a rate that is
-believed, what was added fades; a car that turns towards the side with more grip is damped all the same.
+believed, what it had left of that fades, and only a turn that both show is damped: the wrong one would turn the car.
 """
 
 from __future__ import annotations
@@ -27,24 +27,30 @@ KNOWN_S = 0.25
 TURNED_RAD = 0.004
 TURNED_WITHIN_S = 1.0
 ASTRAY_RAD = -0.15
-#: Lateral speed that yaw rate and accelerometer add up to, m/s, beyond which they contradict each other; what is older
-#: than this, s, is forgotten: the car slips aside slowly, too.
+#: Lateral speed that yaw rate and accelerometer add up to, m/s, or part of the car's, beyond which they contradict each
+#: other; what is older than this, s, is forgotten: the car slips aside slowly, too.
 ASIDE_MPS = 0.7
+ASIDE_RAD = 0.03
 ASIDE_S = 1.0
 #: What is felt towards the side with more grip may be camber, roll and noise up to this, m/s2; and up to this much less
 #: is felt than a car that begins to turn shows.
 FELT_MPS2 = 0.2
 NOT_YET_FELT_MPS2 = 1.0
-#: What is felt becomes a yaw rate by this speed, m/s, at least.
-LEAST_MPS = 1.0
+#: Yaw rate and lateral acceleration become each other by this speed, m/s, at least: brakes of steered wheels are felt
+#: to the side, too.
+LEAST_MPS = 10.0
 #: The rate of a car that brakes unequally is no longer the same than this, s.
 SAME_S = 0.1
-#: Rate towards the side with more grip beyond which less is added than before, rad/s.
-CALM_RADPS = 0.03
-#: The budget is less by this for each rad/s, N m s: some six times what the tyres do against it at 25 m/s.
-DAMPING_NMS = 16000.0
-#: The same where the rate is believed no more: one of both sensors is right, and the driver has a car to catch.
-LOST_DAMPING_NMS = 8000.0
+#: Lateral acceleration of a turn towards the side with more grip beyond which less is added than before, m/s2; and of
+#: one to the other side, beyond which no more is, as a multiple: the driver catches the car.
+CALM_MPS2 = 0.5
+CAUGHT = 4.0
+#: The budget is less by this for each rad/s, N m s: some eight times what the tyres do against it at 25 m/s.
+DAMPING_NMS = 20000.0
+#: The same where the rate is believed no more.
+LOST_DAMPING_NMS = 10000.0
+#: Friction of the better side on which the growth is what it says: it goes with what tyres hold a car straight by.
+GROWTH_FRICTION = 0.48
 #: Most that is added in front; the rear wheels get this part of it, which leaves them what keeps the car straight.
 MOST_NM = 1500.0
 REAR_PART = 0.3
@@ -61,7 +67,7 @@ class YawState(NamedTuple):
     aside_mps : lateral speed of late, by accelerometer and yaw rate
     turned_rad : angle the car has turned since, towards the side with more grip
     believed : it has turned as unequal brakes turn it, and an accelerometer agrees
-    towards_radps : yaw rate towards the side with more grip, within what is felt
+    towards_radps : yaw rate towards the side with more grip, within what is felt; where it is lost, what both show
     extra_nm : what is added to the yaw budget
     lost : it was believed, and is no more
     """
@@ -107,7 +113,8 @@ def yaw_step(
     growth_nmps : of what is added; 0: the rate is not used
     """
     b, rate = before, yaw_rate_radps
-    faded = max(b.extra_nm - growth_nmps * dt_s, 0.0) if unequal_s != 0.0 else 0.0
+    damped = DAMPING_NMS * max(b.towards_radps, 0.0) if b.believed else 0.0
+    faded = max(b.extra_nm - damped - growth_nmps * dt_s, 0.0) if unequal_s != 0.0 else 0.0
     change = lateral_mps2 - speed_mps * rate
     if math.isnan(change) or growth_nmps == 0.0:
         return no_yaw(faded)
@@ -123,15 +130,19 @@ def yaw_step(
     shown = side * (rate - b.straight_radps)
     turned = b.turned_rad + shown * dt_s
     apart = max(side * change - FELT_MPS2, 0.0) + min(side * change + NOT_YET_FELT_MPS2, 0.0)
-    towards = shown + apart / max(speed_mps, LEAST_MPS)
-    agreed = same <= SAME_S and turned >= ASTRAY_RAD and abs(aside) <= ASIDE_MPS
+    by_mps = max(speed_mps, LEAST_MPS)
+    towards = shown + apart / by_mps
+    agreed = same <= SAME_S and turned >= ASTRAY_RAD and abs(aside) <= max(ASIDE_MPS, ASIDE_RAD * speed_mps)
     known = b.known_s if agreed else 0.0
     found = abs(unequal_s) <= TURNED_WITHIN_S and turned > TURNED_RAD
     believed = known >= KNOWN_S and (b.believed or found)
     lost = (b.believed or b.lost) and not believed
+    if lost:
+        towards = shown + min(side * change, 0.0) / by_mps
     extra = faded
     if believed and braking:
-        pace = 1.0 - max(towards, 0.0) / CALM_RADPS
+        calm = towards * by_mps / CALM_MPS2
+        pace = 1.0 - calm if calm > 0.0 else max(1.0 + calm / CAUGHT, 0.0)
         extra = min(max(b.extra_nm + pace * growth_nmps * dt_s, 0.0), MOST_NM)
     return YawState(b.straight_radps, known, rate, same, b.level_mps2, aside, turned, believed, towards, extra, lost)
 

@@ -22,7 +22,7 @@ from iwm_power_manager.control.types import (
     Measurement,
     initial_state,
 )
-from iwm_power_manager.control.yaw import REAR_PART, no_yaw
+from iwm_power_manager.control.yaw import GROWTH_FRICTION, REAR_PART, no_yaw
 from iwm_power_manager.model.chassis import aerodynamic_force_n, rolling_force_n
 from iwm_power_manager.share import share_path
 from iwm_power_manager.vehicle import load_vehicle
@@ -367,7 +367,7 @@ def test_a_gyroscope_adds_to_both_yaw_budgets_on_the_side_that_the_front_wheels_
     before = remembered(speed_radps=wheels)._replace(front_unequal_s=front_s, rear_unequal_s=rear_s, yaw=seen)
     m = measured(-300e3, wheels)._replace(yaw_rate_radps=1e-6, lateral_mps2=SPEED * 1e-6)
     _, after = step(m, before, tuned)
-    extra_nm = 400.0 + 600.0 * 0.01
+    extra_nm = 400.0 + before.friction.left.friction / GROWTH_FRICTION * 600.0 * 0.01
     for first, axle, moment_nm in ((0, CAR.front, extra_nm), (2, CAR.rear, REAR_PART * extra_nm)):
         apart_nm = abs(after.wheels[first + more].total_nm) - abs(after.wheels[first + 1 - more].total_nm)
         assert apart_nm * axle.track_width_m / 2.0 / axle.wheel.radius_m == pytest.approx(moment_nm, rel=1e-3)

@@ -119,7 +119,8 @@ def known_yaw(m, state, settings):
     """What is remembered of the yaw rate: what it was before, whether it is believed, and what it adds."""
     was, unequal, rate, dt = state.yaw, state.front_unequal_s, m.yaw_rate_radps, m.dt_s
     slipping = m.lateral_mps2 - max(m.speed_mps, 0.0) * rate
-    growth = settings.yaw_rate_growth_nmps * yaw_speed_factor(m.speed_mps, settings)
+    firm = max(side.friction for side in (state.friction.left, state.friction.right))
+    growth = settings.yaw_rate_growth_nmps * min(1.0, yaw_speed_factor(m.speed_mps, settings)) * firm / 0.48
     alike = -0.03 <= unequal <= 0.03
     unknown = was._replace(
         straight_radps=0.0,
@@ -132,7 +133,8 @@ def known_yaw(m, state, settings):
         believed=False,
         towards_radps=0.0,
     )
-    faded = 0.0 if alike else max(0.0, was.extra_nm - dt * growth)
+    left = was.extra_nm - (20000.0 * max(0.0, was.towards_radps) if was.believed else 0.0)
+    faded = 0.0 if alike else max(0.0, left - dt * growth)
     unknown = unknown._replace(lost=False)
     if slipping != slipping or growth == 0.0:
         return unknown._replace(extra_nm=faded)
@@ -148,7 +150,8 @@ def known_yaw(m, state, settings):
     to_left = rate - was.straight_radps
     turning = to_left if unequal > 0.0 else -to_left
     felt = slipping if unequal > 0.0 else -slipping
-    towards = turning + (felt - min(max(felt, -1.0), 0.2)) / max(m.speed_mps, 1.0)
+    by_speed = max(m.speed_mps, 10.0)
+    towards = turning + (felt - min(max(felt, -1.0), 0.2)) / by_speed
     now = was._replace(
         shown_radps=rate,
         same_s=was.same_s + dt if rate == was.shown_radps else 0.0,
@@ -157,14 +160,16 @@ def known_yaw(m, state, settings):
         towards_radps=towards,
         extra_nm=faded,
     )
-    if now.same_s > 0.1 or now.turned_rad < -0.15 or not -0.7 <= now.aside_mps <= 0.7:
+    if now.same_s > 0.1 or now.turned_rad < -0.15 or abs(now.aside_mps) > max(0.7, 0.03 * m.speed_mps):
         now = now._replace(known_s=0.0)
     turned_at_first = -1.0 <= unequal <= 1.0 and now.turned_rad > 0.004
     now = now._replace(believed=now.known_s >= 0.25 and (was.believed or turned_at_first))
     now = now._replace(lost=not now.believed and (was.lost or was.believed))
+    if now.lost:
+        now = now._replace(towards_radps=turning + min(0.0, felt / by_speed))
     if now.believed and m.power_demand_w < 0.0:
-        calm = (0.03 - towards) / 0.03 if towards > 0.0 else 1.0
-        now = now._replace(extra_nm=min(1500.0, max(0.0, was.extra_nm + dt * growth * calm)))
+        pace = 1.0 - 2.0 * towards * by_speed if towards > 0.0 else max(0.0, 1.0 + 0.5 * towards * by_speed)
+        now = now._replace(extra_nm=min(1500.0, max(0.0, was.extra_nm + dt * growth * pace)))
     return now
 
 
@@ -220,9 +225,7 @@ def yaw_budget(name, state, settings, speed, braking, yaw):
         return [most, most]
     factor = yaw_speed_factor(speed, settings)
     unequal, lasting = getattr(state, f"{name}_unequal_s"), state.front_unequal_s
-    damping = 16000.0 if yaw.believed else 0.0
-    if yaw.lost and not yaw.believed:
-        damping = 8000.0
+    damping = 20000.0 if yaw.believed else 10000.0 if yaw.lost else 0.0
     added = yaw.extra_nm - damping * max(yaw.towards_radps, 0.0)
     if name == "rear":
         added = 0.3 * max(added, 0.0)
