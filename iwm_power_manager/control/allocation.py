@@ -234,10 +234,10 @@ def _frictions_nm(
 ) -> Wheels:
     """Friction torque of each wheel."""
     return (
-        friction_nm(f.left, front.left.gated, delivered_nm[0], braking, vehicle.front),
-        friction_nm(f.right, front.right.gated, delivered_nm[1], braking, vehicle.front),
-        friction_nm(r.left, rear.left.gated, delivered_nm[2], braking, vehicle.rear),
-        friction_nm(r.right, rear.right.gated, delivered_nm[3], braking, vehicle.rear),
+        friction_nm(f.left, front.left, delivered_nm[0], braking, vehicle.front),
+        friction_nm(f.right, front.right, delivered_nm[1], braking, vehicle.front),
+        friction_nm(r.left, rear.left, delivered_nm[2], braking, vehicle.rear),
+        friction_nm(r.right, rear.right, delivered_nm[3], braking, vehicle.rear),
     )
 
 

@@ -226,14 +226,14 @@ def pair_of(
     if settings.gate_mode == GATE_MODE_TABLE2:
         left_gate = right_gate = worse_slip(slips[k], slips[k + 1])
     left = wheel_of(
-        w[k], slips[k], left_gate, speed_mps, demand, gain[k], lower_part, targets[k], least_nm[k], dt,
-        first, before[k], w[k + 1], before[k + 1], axle, settings, vehicle,
+        w[k], slips[k], left_gate, speed_mps, demand, gain[k], m.motor_stuck_nm[k], lower_part, targets[k],
+        least_nm[k], dt, first, before[k], w[k + 1], before[k + 1], axle, settings, vehicle,
     )  # fmt: skip
     right = left
     if not alike:
         right = wheel_of(
-            w[k + 1], slips[k + 1], right_gate, speed_mps, demand, gain[k + 1], lower_part, targets[k + 1],
-            least_nm[k + 1], dt, first, before[k + 1], w[k], before[k], axle, settings, vehicle,
+            w[k + 1], slips[k + 1], right_gate, speed_mps, demand, gain[k + 1], m.motor_stuck_nm[k + 1], lower_part,
+            targets[k + 1], least_nm[k + 1], dt, first, before[k + 1], w[k], before[k], axle, settings, vehicle,
         )  # fmt: skip
     left_capacity, right_capacity = _capacities_nm(left, right, moments_nm, axle)
     return Pair(left, right, left_capacity, right_capacity, alike)
@@ -342,11 +342,12 @@ def pair_limits(pair: Pair, shared: Shared, short: bool, braking: bool, axle: Ax
 
 
 @kernel
-def friction_nm(given: Given, gated: bool, delivered_nm: float, braking: bool, axle: Axle) -> float:
-    """Friction torque that makes up, with what the motor delivers, the braking torque asked for.
+def friction_nm(given: Given, wheel: Wheel, delivered_nm: float, braking: bool, axle: Axle) -> float:
+    """Friction torque that makes up, with what the motor delivers, the torque asked for.
 
-    A motor that is still on its way down from driving, or stuck, is held against: braking gets through at once.
+    A motor that is still on its way down from driving, or stuck, is held against: braking gets through at once. One
+    that is stuck is held against while driving, too, to what it is to drive by.
     """
-    if not braking or gated:
+    if wheel.gated or not (braking or wheel.held):
         return given.friction_nm
     return max(min(given.total_nm - delivered_nm, 0.0), -axle.friction_brake.max_torque_nm)

@@ -6,7 +6,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF, Settings
-from iwm_power_manager.control.slip import UNLIMITED_NM, filtered, gained_radps, limiter_torque_nm, road_torque_nm
+from iwm_power_manager.control.slip import (
+    LEAST_SLIP_SPEED_MPS,
+    UNLIMITED_NM,
+    filtered,
+    gained_radps,
+    limiter_torque_nm,
+    road_torque_nm,
+)
 from iwm_power_manager.control.types import WheelState
 from iwm_power_manager.control.wheel_doubt import FREE_PART, HELD_MPS, HELD_PART
 from iwm_power_manager.jit import kernel
@@ -32,6 +39,7 @@ class Wheel(NamedTuple):
     road_nm : torque the road took from it, filtered
     slip : filtered
     gated : held at zero torque
+    held : driven by a motor that is stuck, and held by its brake to what it is given
     actuator_nm : largest torque of motor or brake in the direction of the demand
     gain : part of a commanded torque that its motor delivers
     grip_nm : largest torque the slip limiter allows
@@ -43,6 +51,7 @@ class Wheel(NamedTuple):
     road_nm: float
     slip: float
     gated: bool
+    held: bool
     actuator_nm: float
     gain: float
     grip_nm: float
@@ -86,6 +95,17 @@ def _slips_by_little(
 
 
 @kernel
+def _actuator_nm(
+    braking: bool, fast_radps: float, speed_mps: float, gain: float, stuck_nm: float, heat: float, axle: Axle
+) -> float:
+    """Largest torque of motor or brake in the direction of the demand; `stuck_nm`: of a motor that its brake holds."""
+    if braking:
+        weakest = gain * regeneration_limit_nm(fast_radps, speed_mps, heat, axle.motor)
+        return max(axle.friction_brake.max_torque_nm, weakest)
+    return max(gain * torque_limit_nm(fast_radps, heat, axle.motor), stuck_nm)
+
+
+@kernel
 def wheel_of(
     wheel_speed_radps: float,
     slip: float,
@@ -93,6 +113,7 @@ def wheel_of(
     speed_mps: float,
     demand_w: float,
     gain: float,
+    stuck_nm: float,
     lower_part: float,
     slip_target: float,
     least_nm: float,
@@ -150,18 +171,17 @@ def wheel_of(
         asked = braking or (settings.gate_driving and demand_w > 0.0)
         taken_nm, w, other = max(grip, abs(road)), wheel_speed_radps, other_radps
         gated = gated or (asked and _slips_by_little(braking, taken_nm, w, other, speed_mps, least_nm, radius, vehicle))
+    # A brake that makes the wheel lag holds against nothing: the torque is in the report only.
+    held = not braking and stuck_nm > 0.0 and slip * speed_mps > -LEAST_SLIP_SPEED_MPS
     return Wheel(
         speed_radps=wheel_speed_radps,
         conversion_radps=conversion,
         fast_radps=fast,
         road_nm=road,
         slip=slip,
-        gated=gated,
-        actuator_nm=max(
-            axle.friction_brake.max_torque_nm, gain * regeneration_limit_nm(fast, speed_mps, before.heat, axle.motor)
-        )
-        if braking
-        else gain * torque_limit_nm(fast, before.heat, axle.motor),
+        gated=gated and not held,
+        held=held,
+        actuator_nm=_actuator_nm(braking, fast, speed_mps, gain, stuck_nm if held else 0.0, before.heat, axle),
         gain=gain,
         grip_nm=grip,
     )

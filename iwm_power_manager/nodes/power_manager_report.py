@@ -190,7 +190,8 @@ class PowerManagerReport:
                 self.doubts = [sensors.message] if sensors.level != diagnostics.OK else []
                 self.doubts += [words for words in (self._cut, self._against, self._stuck) if words]
             statuses.append(sensors)
-            statuses.append(diagnostics.motors_status(controller.actuators, self._wheel_names))
+            friction_nm = controller.command.friction_torque_nm if controller.command else (0.0,) * 4
+            statuses.append(diagnostics.motors_status(controller.actuators, friction_nm, self._wheel_names))
             statuses.append(diagnostics.brakes_status(controller.brake_gain, self._wheel_names))
             statuses.append(self._loop.report(self._rate_hz, values))
         self._activity.clear()

@@ -205,15 +205,16 @@ def control_status(
     return Status("control", ERROR if missing else WARN, f"{mode}{reason}", values)
 
 
-def motors_status(actuators: ActuatorState, wheel_names: Sequence[str]) -> Status:
-    """Which motors do not do what they are told, and what of their torque is counted on."""
+def motors_status(actuators: ActuatorState, friction_nm: Wheels, wheel_names: Sequence[str]) -> Status:
+    """Which motors do not do what they are told, what of their torque is counted on, and whose brakes hold them."""
     values = {"reported torque": "judged" if actuators.reporting else "none that follows the commands"}
     problems: list[tuple[int, str]] = []
-    for name, motor in zip(wheel_names, actuators.motors, strict=True):
+    for name, motor, brake_nm in zip(wheel_names, actuators.motors, friction_nm, strict=True):
         values[f"motor {name}"] = _words(motor.verdict)
         values[f"motor {name}: counted on (%)"] = f"{100.0 * motor.gain:.0f}"
         if motor.verdict is not MotorVerdict.GOOD:
-            problems.append((ERROR, f"motor {name} is {_words(motor.verdict)}"))
+            held = f" at {motor.stuck_nm:.0f} N m, held by its brake" if motor.stuck_nm and brake_nm else ""
+            problems.append((ERROR, f"motor {name} is {_words(motor.verdict)}{held}"))
     level, message = _worst(problems)
     return Status("motors", level, message, values)
 

@@ -150,6 +150,47 @@ def test_what_a_stuck_motor_does_is_done_by_that_wheel(wheel, demand):
     assert left == pytest.approx(stuck)
 
 
+def stuck_driving(wheel, demand, nm=25.0, wheels=None, before=None):
+    """A car one of whose motors is stuck at a torque that drives: what arrives at each wheel, and the friction."""
+    m = measured(demand, wheels, gain=one(wheel, 0.0, (1.0,) * 4))
+    command, after = step(m._replace(motor_stuck_nm=one(wheel, nm, (0.0,) * 4)), before or remembered(), LIMITER)
+    return [state.total_nm for state in after.wheels], command.friction_torque_nm
+
+
+@WHEELS
+@pytest.mark.parametrize("slip", [0.0, 0.01, 0.5])
+def test_a_motor_that_is_stuck_driving_is_held_by_its_brake_while_nothing_is_asked_for(wheel, slip):
+    """Also one that spins and would be gated: without torque from the road it would go on."""
+    arrived, friction = stuck_driving(wheel, 0.0, wheels=one(wheel, rolling()[wheel] / (1.0 - slip), rolling()))
+    assert arrived == [0.0] * 4
+    assert friction == pytest.approx(one(wheel, -25.0, (0.0,) * 4))
+
+
+@WHEELS
+def test_it_drives_by_as_much_as_the_other_wheel_of_its_axle_and_no_more_than_it_has(wheel):
+    before = remembered(motor_nm=(10.0,) * 4)
+    arrived, friction = stuck_driving(wheel, 600.0, before=before)
+    assert arrived[wheel] == pytest.approx(arrived[wheel ^ 1])
+    assert 0.0 < arrived[wheel] == pytest.approx(25.0 + friction[wheel])
+    arrived, friction = stuck_driving(wheel, 30e3, before=before)
+    assert (arrived[wheel], friction) == (25.0, (0.0,) * 4)
+
+
+@WHEELS
+@pytest.mark.parametrize("demand", [0.0, 600.0])
+def test_a_motor_that_is_stuck_braking_is_helped_by_no_brake(wheel, demand):
+    assert stuck_driving(wheel, demand, -25.0)[1] == (0.0,) * 4
+
+
+@WHEELS
+@pytest.mark.parametrize("demand", [0.0, 600.0])
+def test_a_brake_that_makes_its_wheel_lag_holds_no_more(wheel, demand):
+    """The torque is in the report only: the brake would drag."""
+    for lag_mps, holds in ((0.29, True), (0.31, False)):
+        lagging = one(wheel, (SPEED - lag_mps) / RADII[wheel], rolling())
+        assert any(stuck_driving(wheel, demand, wheels=lagging)[1]) == holds
+
+
 @WHEELS
 def test_the_power_of_an_axle_is_that_of_its_two_wheels(wheel):
     wheels = one(wheel, 1.03 * rolling()[wheel], rolling())

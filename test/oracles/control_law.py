@@ -279,6 +279,7 @@ class Wheel:
     gain: float
     stuck: float
     gated: bool = False
+    held: bool = False
     doubtful: bool = False  # so near to its edge that rounding decides
     slip: float = 0.0
     road: float = 0.0
@@ -388,10 +389,15 @@ def step(m, state, settings, vehicle, decide):
             weakest = wheel.gain * regeneration_limit(wheel.fast, m.speed_mps, wheel.before.heat, wheel.axle.motor)
             brake = wheel.axle.friction_brake.max_torque_nm or weakest
             strongest = wheel.gain * torque_limit(wheel.fast, wheel.before.heat, wheel.axle.motor)
+            # A motor that is stuck driving drives, and its brake sees to how much, unless the wheel lags by it.
+            wheel.held = not braking and wheel.stuck > 0.0 and -wheel.slip * m.speed_mps < 0.3
+            if wheel.held:
+                strongest = max(strongest, wheel.stuck)
             wheel.room = brake if braking else strongest
             if settings.gate_mode == GATE_MODE_LIMITER:
                 wheel.grip = grip(braking, wheel.road, wheel.speed, m.speed_mps, wheel.target, settings, wheel.axle)
                 wheel.gated |= keeps_slip(braking, wheels, i, m, state.wheels, settings, vehicle)
+            wheel.gated &= not wheel.held
             wheel.own = wheel.most = 0.0 if wheel.gated else min(wheel.room, wheel.grip)
         geometry = axle.wheels[0].axle
         mosts = [wheel.most for wheel in axle.wheels]
@@ -430,7 +436,7 @@ def step(m, state, settings, vehicle, decide):
         bits.add(t.LIMIT_BATTERY_CHARGE if side == "charge" else t.LIMIT_BATTERY_DISCHARGE)
     for wheel in wheels:
         wheel.motor *= factor
-        if braking and not wheel.gated:
+        if wheel.held or (braking and not wheel.gated):
             # Whatever the motor does, wheel and brake together brake as asked.
             delivered = wheel.gain * wheel.motor + wheel.stuck
             wheel.friction = -min(max(delivered - wheel.total, 0.0), wheel.axle.friction_brake.max_torque_nm)

@@ -51,6 +51,7 @@ LIMITS = {
 }
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 GOOD = (WheelVerdict.GOOD,) * 4
+NONE_NM = (0.0,) * 4
 SECOND = 10**9
 
 
@@ -222,12 +223,21 @@ def test_a_change_is_told_once_and_not_too_often() -> None:
 
 def test_a_motor_that_does_not_follow_is_named():
     motors = (Evidence(), Evidence(MotorVerdict.DEAD, 0.0), Evidence(MotorVerdict.WEAK, 0.5), Evidence())
-    status = motors_status(ActuatorState(motors=motors, reporting=True), ("fl", "fr", "rl", "rr"))
+    status = motors_status(ActuatorState(motors=motors, reporting=True), NONE_NM, ("fl", "fr", "rl", "rr"))
     assert (status.level, status.message) == (ERROR, "motor fr is dead; motor rl is weak")
     assert status.values["motor rl: counted on (%)"] == "50"
     assert status.values["motor fl"] == "good"
-    quiet = motors_status(ActuatorState(), ("fl", "fr", "rl", "rr"))
+    quiet = motors_status(ActuatorState(), NONE_NM, ("fl", "fr", "rl", "rr"))
     assert (quiet.level, quiet.values["reported torque"]) == (OK, "none that follows the commands")
+
+
+@pytest.mark.parametrize(("brake_nm", "more"), [(0.0, ""), (-60.0, " at 60 N m, held by its brake")])
+def test_a_brake_that_holds_a_stuck_motor_is_said(brake_nm, more):
+    motors = (Evidence(), Evidence(), Evidence(), Evidence(MotorVerdict.STUCK, 0.0, 60.0))
+    status = motors_status(
+        ActuatorState(motors=motors, reporting=True), (-200.0, 0.0, 0.0, brake_nm), ("fl", "fr", "rl", "rr")
+    )
+    assert (status.level, status.message) == (ERROR, f"motor rr is stuck{more}")
 
 
 def test_a_brake_that_gives_less_than_it_is_told_is_named():
