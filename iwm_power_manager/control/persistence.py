@@ -13,8 +13,9 @@ but for the part of its slip that wheels do not reach while it lasts (`model.dec
 The noise goes on. The cost-to-go of a policy that knows none would answer the next jump with a change; what really
 happens is that the share is held and meets the same jumps again. So the mean cost of a step counts for as long as the
 estimate is good: until the signal, which wanders q = s2 K^2 / (1 - K) a sample, is on average over that time as
-uncertain as the estimate, s2 K. That is 2 (1 - K) / K samples; the cost-to-go counts from then on. A change has
-to be worth more than chance explains: the standard error of the mean of what it saves, for the same time.
+uncertain as the estimate, s2 K. That is 2 (1 - K) / K samples; the cost-to-go counts from then on. A change
+away from the middle has to be worth more than chance explains: the standard error of the mean of what it saves, for the
+same time.
 
 Where no noise can be told from chance, which is every drive without any, K is 1 and nothing is averaged.
 """

@@ -279,7 +279,7 @@ def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_
 
 @settings(max_examples=60)
 @given(st.lists(POWER, min_size=4, max_size=4), st.floats(2.0, 35.0), SHARE, st.sampled_from([0.2, 0.9]))
-def test_with_a_budget_a_change_has_to_be_worth_more_than_the_mean_over_noise_is_uncertain(
+def test_with_a_budget_a_change_away_from_the_middle_has_to_be_worth_more_than_the_mean_over_noise_is_uncertain(
     demands, speed, previous, friction
 ):
     gain = 0.5
@@ -303,6 +303,7 @@ def test_with_a_budget_a_change_has_to_be_worth_more_than_the_mean_over_noise_is
             continue
         saved = np.array([settled_j(power, previous) - settled_j(power, share) for power in demands])
         chance = math.sqrt(np.average((saved - weights @ saved) ** 2, weights=weights) * (weights @ weights))
+        chance *= abs(share - 0.5) > abs(previous - 0.5)
         mean = sum(weight * step_j(power, share) for weight, power in zip(weights, demands, strict=True))
         changed = table.switching_cost_j * splits.price_units(share - previous)
         changed += table.switching_fixed_cost_j * (share != previous)

@@ -165,6 +165,7 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
     level = price_level(factor) if policy.dearer_cost_j.shape[0] > 0 else 0.0
     price = factor * policy.switching_cost_j
     budgeted = policy.changes_per_min > 0.0
+    unequal = abs(previous - 0.5)
     demand_w = situation.power_demand_w
     gain = situation.jitter.gain
     half = _half_believed(demand_w, situation, vehicle, policy)
@@ -207,7 +208,9 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
             worth = steps * step + trust * 0.5 * (later + earlier)
             if steady and step > 0.0:
                 worth = max(worth, step + min(later, earlier))
-            worth -= switching + (steps * found.doubt_j if budgeted else 0.0)
+            worth -= switching
+            if budgeted and abs(share - 0.5) > unequal:
+                worth -= steps * found.doubt_j
             if worth + _ROUNDING * abs(kept.step_j) <= most:
                 break
         if k >= 0 and worth > most:
