@@ -24,6 +24,8 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from io import BytesIO
+from itertools import accumulate
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,6 +42,7 @@ MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
+_ENTRY = struct.Struct("<QQ")  # of a message index: log time, place in the chunk
 HEAD_BYTES = _HEAD.size
 RECORD_OVERHEAD_BYTES = _MESSAGE.size
 _MESSAGE_FIELDS_BYTES = RECORD_OVERHEAD_BYTES - HEAD_BYTES
@@ -147,6 +150,16 @@ def _stated_length(data: Bytes, opcode: int, body: int, length: int) -> int:
     return max(length, _MESSAGE_FIELDS_BYTES) if opcode == Opcode.MESSAGE else length
 
 
+def _goes_back(index: bytes) -> bool:
+    """Whether a message index shows that the clock was set back between two messages of its channel."""
+    entries = list(_ENTRY.iter_unpack(index[: len(index) // _ENTRY.size * _ENTRY.size]))
+    if entries == sorted(entries):  # as nearly always
+        return False
+    times = [time_ns for time_ns, _ in sorted(entries, key=itemgetter(1))]
+    newest = accumulate(times, max)
+    return any(later < before - limits.SET_BACK_NS for before, later in zip(newest, times[1:], strict=False))
+
+
 def _next_record(data: Bytes, offset: int, begin: re.Pattern[bytes]) -> int:
     """Where the next chunk, or message that a record follows, begins whose lengths agree; the file's end for none."""
     starts = (found.start() for found in begin.finditer(data, offset))
@@ -241,6 +254,7 @@ class Source:
     topics, counts : topic and number of messages by channel, as far as they can be read
     pieces : all messages, in the order of the file
     custom_data : custom metadata inside of the file, our own recorder's or rosbag2's
+    goes_back : log times of a channel go back within a piece, as a clock that is set back makes them
     """
 
     def __init__(self, path: Path) -> None:
@@ -251,6 +265,14 @@ class Source:
         self.pieces: list[Piece] = []
         self.header = Header(profile="ros2", library="")
         self.custom_data: dict[str, str] = {}
+        self.goes_back = False
+        self._newest_ns: dict[int, int] = {}
+
+    def _follow(self, channel: int, log_time_ns: int) -> None:
+        """See whether this message, the next of its channel, was recorded with the clock set back."""
+        newest_ns = self._newest_ns.setdefault(channel, log_time_ns)
+        self.goes_back |= log_time_ns < newest_ns - limits.SET_BACK_NS
+        self._newest_ns[channel] = max(newest_ns, log_time_ns)
 
     def unpack(self, piece: Piece) -> list[ChannelMessage]:
         """Messages of a piece in the order of the file, as far as they can be read; a line of damage for others."""
@@ -331,6 +353,8 @@ class McapSource(Source):
                     self._too_much_at = min(self._too_much_at, record.start)
             elif record.opcode == Opcode.MESSAGE:
                 self._add_to_run(record)
+            elif record.opcode == Opcode.MESSAGE_INDEX:
+                self.goes_back |= _goes_back(self.data[record.body + _ENTRIES_AT : record.end])
             elif record.opcode == UNREADABLE and record.end < len(self.data):
                 self.note(f"holds no record from byte {record.start} to {record.end}")
                 statistics = None
@@ -365,7 +389,9 @@ class McapSource(Source):
 
     def _add_to_run(self, record: Record) -> None:
         """A message outside of chunks: the run it belongs to is read in one piece, like a chunk."""
-        log_time = start_ns = end_ns = _MESSAGE.unpack_from(self.data, record.start)[4]
+        _, _, channel, _, log_time, _ = _MESSAGE.unpack_from(self.data, record.start)
+        self._follow(channel, log_time)
+        start_ns = end_ns = log_time
         last = self.pieces[-1].place if self.pieces else None
         if last and last.opcode == Opcode.MESSAGE and last.end == record.start and last.end - last.start < _RUN_BYTES:
             start_ns, end_ns, *_ = self.pieces.pop()

@@ -180,9 +180,10 @@ class BagReader(ExitStack):
         filled = [piece for piece in self._pieces if piece.end_ns]  # one without messages has no times
         ends = accumulate((piece.end_ns for piece in filled), max)
         jumps = any(after.start_ns < end - limits.SET_BACK_NS for end, after in zip(ends, filled[1:], strict=False))
+        within = any(source.goes_back for source in self.sources)
         alone = len(filled) == 1 and filled[0].end_ns - filled[0].start_ns > limits.SET_BACK_NS
         newest: dict[tuple[str, str | None], int] = {}
-        for piece in filled if jumps or alone else ():
+        for piece in filled if jumps or within or alone else ():
             series, names = _DIGITS.sub("", piece.source.path.name), self._names[piece.source]
             for log_time, channel, *_ in self._unpack(piece):
                 topic = series, names.get(channel)

@@ -125,6 +125,7 @@ class SqliteSource(Source):
         size = _PIECE_BYTES
         for row, number, log_time, length in self._rows("length(data)", _FIRST, _LAST):
             self.counts[number] += 1
+            self._follow(number, log_time)
             first, start_ns, end_ns = row if self.pieces else _FIRST, log_time, log_time
             if size < _PIECE_BYTES:
                 start_ns, end_ns, _, (first, _) = self.pieces.pop()

@@ -11,6 +11,7 @@ driver's reaction to power that was not delivered, another mass.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -71,7 +72,7 @@ class Consumption:
             self.idle_drag_wh += drag
             self.friction_wh += brake_nm[wheel] * speed * hours
             self.wheel_work_wh += (torque + brake_nm[wheel]) * speed * hours - drag
-        self.distance_m += measurement.speed_mps * measurement.dt_s
+        self.distance_m += abs(measurement.speed_mps) * measurement.dt_s
         self.chemical_wh += chemical_power_w(electrical, vehicle.battery) * hours
         self.electrical_wh += electrical * hours
         self.steps += 1
@@ -107,23 +108,25 @@ def what_if(
         The bag gives no step, or the car does not move.
     """
     vehicle = plans[0][1].vehicle.params
-    forces_n: dict[int, float] = {}
+    forces_n: dict[tuple[int, int], float] = {}  # by stamp, and how often it came: a clock may be set back
     rows: list[Consumption] = []
     for label, plan in plans:
         replay = Replay(bag, plan)
         recorded = Consumption("recorded") if replay.exact and not rows else None
-        row = Consumption(label)
+        row, seen = Consumption(label), Counter[int]()
         for _, steps in replay.steps(progress):
             for step in steps:
                 measurement = measurement_of(step.values)
+                key = step.stamp_ns, seen[step.stamp_ns]
+                seen[step.stamp_ns] += 1
                 if recorded is not None:
                     with suppress(ValueError, OverflowError):  # numbers that are no command: the comparison shows them
                         was = command_of(step.recorded[DECIDED])
                         torques = measurement, was.motor_torque_nm, was.friction_torque_nm
-                        forces_n[step.stamp_ns] = force_n(vehicle, *torques)
+                        forces_n[key] = force_n(vehicle, *torques)
                         recorded.add(vehicle, *torques)
                 motor_nm, brake_nm = step.command.motor_torque_nm, step.command.friction_torque_nm
-                wanted_n = forces_n.setdefault(step.stamp_ns, force_n(vehicle, measurement, motor_nm, brake_nm))
+                wanted_n = forces_n.setdefault(key, force_n(vehicle, measurement, motor_nm, brake_nm))
                 row.add(vehicle, measurement, at_force(vehicle, measurement, motor_nm, brake_nm, wanted_n), brake_nm)
         report = replay.report()
         if not report.steps:

@@ -141,6 +141,25 @@ def test_a_bag_whose_clock_was_set_back_is_read_in_the_order_of_recording(tmp_pa
         assert note.endswith("the clock was set back meanwhile: it is read in the order of recording")
 
 
+@pytest.mark.parametrize("storage", ["chunks", "no chunks", "sqlite3"])
+def test_a_clock_that_was_set_back_within_what_is_read_at_once_is_seen_too(tmp_path: Path, storage: str) -> None:
+    """Three messages fill a piece; what follows is later than all before, so that the pieces' times do not show it."""
+    times = [0, 1, 2, 5, 7, 4, 8, 9, 10]
+    shifted = [(foreign.START_NS + time * 10**9, 1, bytes(400_000)) for time in times]
+    path = tmp_path / "bag"
+    if storage == "sqlite3":
+        foreign.write_sqlite(path, shifted)
+    elif storage == "chunks":
+        foreign.write_bag(path, shifted, chunk_bytes=2**20)
+    else:
+        foreign.write_records(path / "a_0.mcap", foreign.announced() + foreign.message_records(shifted))
+        foreign.write_metadata(path)
+    with BagReader(path) as reader:
+        assert [m.log_time_ns for m in reader.messages()] == [time_ns for time_ns, *_ in shifted]
+        (note,) = reader.notes
+    assert note.endswith("the clock was set back meanwhile: it is read in the order of recording")
+
+
 def test_files_of_two_recorders_are_merged_by_their_log_times(tmp_path: Path) -> None:
     later, earlier = foreign.drive()[150:], foreign.drive()[:150]
     foreign.write_mcap(tmp_path / "bag" / "a_0.mcap", later)

@@ -19,6 +19,7 @@ from iwm_power_manager.exit_codes import BAD_INPUT, DONE
 from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.recorded import read_signal
 from iwm_power_manager.replay.run import Replay
+from iwm_power_manager.replay.what_if import what_if
 from iwm_power_manager.signals.mapping import load_mapping
 from iwm_power_manager.tools.replay import main
 
@@ -143,6 +144,20 @@ def test_a_drive_whose_clock_was_set_back_is_replayed_and_learned_from_as_it_was
     said = capsys.readouterr().out
     assert "the clock was set back meanwhile: it is read in the order of recording" in said
     assert "damaged" not in said
+
+
+def test_a_step_whose_stamp_comes_again_has_its_own_force(tmp_path: Path, mapping: Path) -> None:
+    """A simulator that is started over stamps its second drive as its first: both add up to both alone."""
+    gentle = [(t, n, data[:4] + struct.pack("<d", 500.0) if n == 1 else data) for t, n, data in drive()]
+    plan = make_plan(Choice(strategy="equal", mapping=str(mapping)), {})
+
+    def consumed_wh(name: str, entries: list[foreign.Entry]) -> float:
+        with BagReader(write_bag(tmp_path / name, entries)) as reader:
+            (row,), _ = what_if(reader, [("equal", plan)])
+            return row.chemical_wh
+
+    alone = consumed_wh("first", drive()) + consumed_wh("second", gentle)
+    assert consumed_wh("both", drive() + gentle) == pytest.approx(alone, rel=0.05)
 
 
 def test_demands_whose_stamps_go_back_are_not_left_out_in_silence(tmp_path: Path, mapping: Path) -> None:

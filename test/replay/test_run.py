@@ -699,6 +699,9 @@ def test_energy_of_a_constant_step_is_power_times_time(drive: Path) -> None:
     for _ in range(8):
         found.add(car, measurement, (20.0,) * 4, (0.0, 0.0, -1.0, -1.0))
     assert found.distance_m == pytest.approx(40.0)
+    backwards = Consumption("x")
+    backwards.add(car, measurement._replace(speed_mps=-10.0, wheel_speed_radps=(-30.0,) * 4), (-20.0,) * 4, (0.0,) * 4)
+    assert backwards.distance_m == pytest.approx(5.0)
     assert found.electrical_wh == pytest.approx(4 * electrical_power_w(20.0, 30.0, car.front.motor) * 4.0 / 3600.0)
     assert found.chemical_wh > found.electrical_wh
     assert found.friction_wh == pytest.approx(-2 * 30.0 * 4.0 / 3600.0)
