@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +46,11 @@ _LIKELY = {
     math.pi / 180.0: "wheel_speed in deg/s",
 }
 _NEAR = 0.05
+#: A demand explains the car's motion where so many seconds correlate so much; so many times more energy than was asked
+#: for is no other car's mass and no slope.
+_LEAST_SECONDS, _EXPLAINS, _TIMES_DEMAND = 10, 0.7, 5.0
+#: Powers that are taken for watts, by what they are of it.
+_POWERS = {1000.0: "kW", 735.5: "PS", 745.7: "hp"}
 
 
 class Steepest(NamedTuple):
@@ -154,6 +160,28 @@ def apart(shown: float, rolled: float, radius_m: float, least: float = _APART) -
     meant = [text for factor, text in likely.items() if math.isclose(ratio, factor, rel_tol=_NEAR)]
     words = " or ".join(meant) or "another unit, or another wheel radius"
     return f"speed is {ratio:.3g} times what wheel_speed and a radius of {radius_m:g} m give: {words}?"
+
+
+def demand_apart(demanded_j: Sequence[float], gained_j: Sequence[float]) -> str:
+    """A line, if a demand's sign or unit cannot be the one it was read with; "" else.
+
+    Parameters
+    ----------
+    demanded_j, gained_j : second by second, what was asked for and how the car's kinetic energy changed
+    """
+    if len(demanded_j) < _LEAST_SECONDS:
+        return ""
+    (demand, both), (_, gain) = np.cov(demanded_j, gained_j)
+    if not demand or not gain or both**2 < _EXPLAINS**2 * demand * gain:
+        return ""
+    if both < 0.0:
+        return "the car slows down where power_demand drives, and speeds up where it brakes: is its sign wrong?"
+    ratio = both / demand
+    if ratio < _TIMES_DEMAND:
+        return ""
+    meant = [unit for times, unit in _POWERS.items() if times / 2.0 < ratio < times]
+    words = f"is it in {' or '.join(meant)}" if meant else "another unit, or another car"
+    return f"the car gains {ratio:.3g} times the energy that power_demand asks for: {words}?"
 
 
 def hint(time_s: FloatArray, speed_mps: FloatArray) -> str:

@@ -318,8 +318,11 @@ class ReconstructedSteps:
             + (f", {bad[topic]} of them bad ({one_line(why.get(topic, 'no number'), 100)})" if bad[topic] else "")
             for topic in sorted(self._stream.topics)
         ]
+        tallies = self._controller.monitor.tallies
         for name, reasons in self.not_believed().items():
-            parts.append(f"{name} not believed: " + ", ".join(f"{count} {reason}" for reason, count in reasons.items()))
+            counts = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in reasons.items())
+            last = tallies[name].why() if name in tallies else ""
+            parts.append(f"{name} not believed: {counts}" + (f" (the last: {last})" if last else ""))
         if self._again:
             parts.append(f"{self._again} wheel speeds with the stamp of the one before")
         parts += [f"{count} without a command: {reason}" for reason, count in self._report.faults.items()]

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 MSG, IDL = "ros2msg", "ros2idl"
+#: What recorders call them, in small letters.
+_ENCODINGS = {MSG: MSG, "": MSG, IDL: IDL, "omgidl": IDL}
+#: The name of a type as DDS has it.
+_DDS_NAME = re.compile(r"::dds_::(\w+)_$", re.ASCII)
 
 #: Largest definition that is read, its deepest nesting, and the numbers and texts it may unroll to.
 MAX_TEXT_BYTES = 256 * 1024
@@ -110,10 +114,12 @@ def _types_of(msgtype: str, encoding: str, text: str, wide: str) -> Types:
     from rosbags.typesys.store import Typestore
 
     try:
-        encoding = IDL if encoding == "omgidl" else encoding
+        encoding = _ENCODINGS.get(encoding.lower(), encoding)
         name = msgtype.replace("::", "/") if encoding == IDL and text else full_name(msgtype)
         known: dict[str, Any] = _parsed(name, encoding, text) if text and encoding in (MSG, IDL) else {}
         name = name if name in known else full_name(msgtype)
+        if text and name not in known and encoding not in (MSG, IDL):
+            raise BagError(f"its definition is written in {encoding!r}; allowed: {MSG}, {IDL}")
         given = _needed(name, known, wide)
         _measure(name, given)
         store = Typestore()
@@ -139,8 +145,8 @@ def standard_types() -> Typestore:
 
 
 def full_name(msgtype: str) -> str:
-    """`package/msg/Type` of `package/Type`; raises `BagError` for what is no name of a message type."""
-    package, _, rest = msgtype.replace("::", "/").partition("/")
+    """`package/msg/Type` of `package/Type` or of a name as DDS has it; raises `BagError` for what is none of a type."""
+    package, _, rest = _DDS_NAME.sub(r"/\1", msgtype).replace("::", "/").partition("/")
     kind, _, name = rest.rpartition("/")
     full = f"{package}/{kind or 'msg'}/{name}"
     if not re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*){2,3}", full, re.ASCII):

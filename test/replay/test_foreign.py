@@ -13,8 +13,10 @@ import pytest
 import zstandard
 
 import foreign_bags as foreign
+from bags_helpers import joint_state_writer
 from foreign_bags import CHANNELS, COUNT, DEMAND, JOINTS, LINE, SPEED, drive, write_bag, write_mcap, write_sqlite
 from iwm_power_manager.bags.reader import BagReader
+from iwm_power_manager.errors import BagError
 from iwm_power_manager.exit_codes import BAD_INPUT, DONE
 from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.recorded import read_signal
@@ -64,6 +66,9 @@ def with_speed(**changes: str) -> list[foreign.Channel]:
             type="my_msgs::dds_::Speed",
         ),
         with_speed(text=SPEED.text.replace("float64 value", "float64\u00a0value"), type="my_msgs::msg::Speed"),
+        with_speed(type="my_msgs::msg::dds_::Speed_"),
+        with_speed(encoding="ROS2MSG"),
+        with_speed(encoding=""),
     ],
     ids=[
         "as written",
@@ -78,6 +83,9 @@ def with_speed(**changes: str) -> list[foreign.Channel]:
         "name as in IDL",
         "module of its own",
         "hard blank",
+        "name as in DDS",
+        "capitals",
+        "encoding not told",
     ],
 )
 def test_a_type_of_another_package_is_read_by_the_definition_in_the_bag(
@@ -180,6 +188,54 @@ def test_a_speed_against_the_wheels_is_said(tmp_path: Path, mapping: Path) -> No
     assert (
         "speed and wheel_speed are of opposite signs in most steps: is the sign of one of them wrong?" in report.notes
     )
+
+
+@pytest.mark.parametrize(
+    ("times", "line"),
+    [
+        (1e-3, "energy that power_demand asks for: is it in kW?"),
+        (-1.0, "the car slows down where power_demand drives, and speeds up where it brakes: is its sign wrong?"),
+        (0.1, "energy that power_demand asks for: another unit, or another car?"),
+        (1.0, ""),
+        (0.5, ""),
+        (0.0, ""),
+    ],
+)
+def test_a_demand_that_cannot_have_moved_the_car_is_said(
+    tmp_path: Path, mapping: Path, times: float, line: str
+) -> None:
+    """The car of 850 kg is pushed and braked by turns of four seconds, and asks for that and its road load."""
+    entries: list[foreign.Entry] = []
+    speed = 8.0
+    for i in range(1000):
+        acceleration = 1.0 if i // 200 % 2 == 0 else -1.0
+        log_ns = foreign.START_NS + i * foreign.PERIOD_NS
+        watts = times * (850.0 * acceleration + 90.0 + 0.4 * speed**2) * speed
+        entries += [
+            (log_ns, 0, foreign.speed(log_ns, speed)),
+            (log_ns + 1, 1, b"\0\1\0\0" + struct.pack("<d", watts)),
+            (log_ns + 2, 2, foreign.joints(log_ns, [speed / 0.33] * 4)),
+        ]
+        speed += acceleration * foreign.PERIOD_NS * 1e-9
+    report, _ = replayed(write_bag(tmp_path / "bag", entries), mapping)
+    assert report.notes == [] if not line else report.notes[0].endswith(line)
+    assert len(report.notes) == bool(line)
+
+
+def test_why_wheel_speeds_are_not_believed_is_said(tmp_path: Path, mapping: Path) -> None:
+    mapping.write_text(foreign.MAPPING.replace(", names: [fl, fr, rl, rr]", ""))
+    three = joint_state_writer(("fl", "fr", "rl"), "velocity")
+    short = [(t, n, three(t, [24.0] * 3) if n == 2 else data) for t, n, data in drive()]
+    with BagReader(write_bag(tmp_path / "bag", short)) as reader:
+        replay = Replay(reader, make_plan(Choice(strategy="equal", mapping=str(mapping)), {}))
+        assert not [step for _, steps in replay.steps() for step in steps]
+        assert "wheel_states not believed: 100 length (the last: length: 3 values for 4 wheels)" in replay.why_no_step()
+
+
+def test_a_definition_in_another_language_is_said(tmp_path: Path, mapping: Path) -> None:
+    bag = write_bag(tmp_path / "bag", drive(), with_speed(encoding="ros1msg"))
+    with pytest.raises(BagError, match=r"its definition is written in 'ros1msg'; allowed: ros2msg, ros2idl"):
+        replayed(bag, mapping)
 
 
 def test_a_fork_of_a_standard_type_is_read_as_the_bag_has_it(tmp_path: Path, mapping: Path) -> None:
