@@ -43,6 +43,9 @@ _TIME_NAMES = {
 }
 
 
+_SLOPE = r"grade|slope|gradient|incline|steigung|neigung|pente"
+
+
 @dataclass
 class Log:
     """A logged speed, in SI units.
@@ -52,6 +55,7 @@ class Log:
     path : of the file
     time_s, speed_mps, grade : of the samples that are usable, times rising from 0
     speed_unit, time_unit : of the file
+    begins_s : time of the first sample in the file
     said : what was guessed or left out, one line each
     """
 
@@ -61,6 +65,7 @@ class Log:
     grade: FloatArray
     speed_unit: str
     time_unit: str
+    begins_s: float = 0.0
     said: list[str] = field(default_factory=list)
 
     @property
@@ -105,7 +110,7 @@ def read_log(
 
     Parameters
     ----------
-    time, speed, grade : names of the columns; "" finds time and speed by their names, and no grade
+    time, speed, grade : names of the columns; "" finds them by their names, the last only where that is `grade`
     time_unit : a unit of `TIME_UNITS`, "clock" (dates or hours:minutes:seconds), or auto
     speed_unit : a unit of `SPEED_UNITS`, or auto: by the column's name, else by the accelerations
     separator, decimal : see `tables.read_table`
@@ -121,9 +126,13 @@ def read_log(
         "time": _column(table, header, "time", time, r"time|stamp|\bt(?![a-z0-9])|zeit"),
         "speed": _column(table, header, "speed", speed, r"speed|veloc|\bv(?![a-z0-9])|geschw|vitesse", _UNIT_NAMES),
     }
+    slopes = [cell for cell in header if re.search(_SLOPE, cell, re.IGNORECASE)]
+    grade = grade or next((cell for cell in slopes if cell.lower() == "grade"), "")
     if grade:
         columns["grade"] = _column(table, header, "grade", grade, "")
     said = [f"columns: {', '.join(f'{name} is {header[i]!r}' for name, i in columns.items())}"]
+    if slopes and not grade:
+        said.append(f"{slopes[0]!r} is left out: --grade takes it, as rise over run")
     if table.decimal == ",":
         said.append("decimal commas")
     values: dict[str, list[float]] = {name: [] for name in columns}
@@ -202,8 +211,11 @@ def _column(
     wanted = [i for i, cell in enumerate(header) if (cell == name if name else re.search(pattern, cell, re.IGNORECASE))]
     wanted.sort(key=lambda i: (all(map(is_nothing, _cells(table, i))), not _named(header[i], units or {})))
     if not wanted:
+        where = f"line {table.rows[0][0]}"
+        if not any(re.search(r"[^\W\d_]", cell) for cell in header):
+            raise ConfigError(table.path, where, "has no header", "a first line that names the columns")
         problem = f"has no column {name!r}" if name else f"has no column that looks like {what}: name it with --{what}"
-        raise ConfigError(table.path, "line 1", problem, ", ".join(header))
+        raise ConfigError(table.path, where, problem, ", ".join(header))
     return wanted[0]
 
 
@@ -273,7 +285,8 @@ def _in_si(
     if lowest < 0.0:
         said.append(f"speeds below zero, down to {lowest:.2g} m/s, taken for rest")
         speed = np.maximum(speed, 0.0)
-    return Log(path, time, speed, arrays["grade"], units["speed"], units["time"], said)
+    begins_s = float(arrays["time"][0]) * TIME_UNITS[units["time"]]
+    return Log(path, time, speed, arrays["grade"], units["speed"], units["time"], begins_s, said)
 
 
 def to_cycle(log: Log, gaps: str, max_gap_s: float, smooth_s: float, rate_hz: float) -> Cycle:
@@ -314,8 +327,14 @@ def to_cycle(log: Log, gaps: str, max_gap_s: float, smooth_s: float, rate_hz: fl
         time = even
     wrong = implausible(time, speed)
     if wrong:
-        raise ConfigError(log.path, "", f"speed {wrong[1]}", "another unit, or --smooth against single wrong samples")
-    return dataclasses.replace(make_cycle(str(log.path), time, speed, grade), name=Path(log.path).stem)
+        at, problem = wrong
+        where = f"{time[at] + log.begins_s:.10g} s" if at >= 0 else ""
+        raise ConfigError(log.path, where, f"speed {problem}", "another unit, or --smooth against single wrong samples")
+    try:
+        return dataclasses.replace(make_cycle(str(log.path), time, speed, grade), name=Path(log.path).stem)
+    except ConfigError as error:  # which sends those who read a cycle here
+        problem = error.problem.replace("(import_cycle converts)", "(--speed-unit and --time-unit say so)")
+        raise ConfigError(log.path, error.key, problem, error.allowed) from None
 
 
 def _without_gaps(time: FloatArray, speed: FloatArray, max_gap_s: float, step_s: float) -> FloatArray:

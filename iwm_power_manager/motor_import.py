@@ -22,10 +22,16 @@ _OTHER_UNITS = {
 }
 #: What the head of a column says of it.
 _TORQUE, _SPEED = re.compile("torque|moment|n ?m(?![a-z])", re.I), re.compile("speed|drehzahl|rpm|min|rad|omega", re.I)
+_LOSS = "loss|verlust"
 #: A map with so few of its grid's points is on no grid.
 _SPARSE = 0.25
 #: Half of a motor's map is never better.
 _TOO_GOOD = 0.99
+#: More than this part of efficiencies in percent are not below 1 %.
+_MIXED = 0.02
+#: A loss so many times that between its neighbours, or so little of it, is a wrong number.
+_APART = 8.0
+_MOST_ALONE = 5
 #: No car's motor has more, N m: those are speeds, or N mm.
 _MOST_NM = 5000.0
 
@@ -97,6 +103,9 @@ def read_points(
         raise ConfigError(path, error.key, problem, allowed) from None
     if percent is None and quantity == "efficiency":
         percent = _in_percent(cells, header, said, doubts)
+    fractions = sum(0.2 < value <= 1.0 for _, _, _, value in cells)
+    if percent and fractions > _MIXED * len(cells):
+        doubts.append(f"{fractions} of {len(cells)} efficiencies in percent are at most 1: fractions of 1 among them?")
     points: dict[tuple[float, float], float] = {}
     scale = RAD_S_PER_RPM if speed_unit == "rpm" else 1.0
     for line, speed, torque, value in cells:
@@ -111,10 +120,35 @@ def read_points(
     if known and known[len(known) // 2] > _TOO_GOOD:
         meant = "losses in kW" if quantity == "loss" else "another quantity"
         doubts.append(f"half of its efficiencies are above {_TOO_GOOD:g}: {meant}?")
+    doubts += _alone(points)
     grid = len({speed for speed, _ in points}) * len({torque for _, torque in points})
     if len(points) < _SPARSE * grid:
         doubts.append(f"its points hardly lie on a grid: {len(points)} of {grid}")
     return Points(points, said, doubts)
+
+
+def _alone(points: dict[tuple[float, float], float]) -> list[str]:
+    """Efficiencies whose losses are far from those of the points around them, as a wrong digit makes them."""
+    loss = {
+        (s, t): abs(s * t) * ((1.0 / eta - 1.0) if t > 0.0 else (1.0 - eta))
+        for (s, t), eta in points.items()
+        if s * t and eta > 0.0
+    }
+    speeds, torques = (sorted({point[i] for point in loss}) for i in (0, 1))
+    row, column = ({value: k for k, value in enumerate(values)} for values in (speeds, torques))
+    doubts = []
+    for (s, t), own in loss.items():
+        i, j = row[s], column[t]
+        beside = [
+            [loss.get((speeds[k], t)) for k in (i - 1, i + 1) if 0 <= k < len(speeds)],
+            [loss.get((s, torques[k])) for k in (j - 1, j + 1) if 0 <= k < len(torques) and torques[k] * t > 0.0],
+        ]
+        between = [math.sqrt(pair[0] * pair[1]) for pair in beside if len(pair) == 2 and pair[0] and pair[1]]
+        if between and (own > _APART * max(between) or own * _APART < min(between)):
+            usual = min(between) if own < min(between) else max(between)
+            where = f"{points[s, t]:.4g} at {s:.4g} rad/s, {t:.4g} N m"
+            doubts.append(f"{where} is a loss of {own:.3g} W between ones of {usual:.3g} W: a wrong digit?")
+    return doubts[:_MOST_ALONE]
 
 
 def _in_percent(
@@ -157,6 +191,8 @@ def _speed_unit(path: Path | str, header: list[str], chosen: str, said: list[str
     for what, (names, allowed) in _OTHER_UNITS.items():
         strange = next((cell for cell, words in zip(header, plain, strict=True) if re.search(names, words, re.I)), None)
         if strange is not None and not (what == "speeds" and (named or chosen != "auto")):
+            if what == "losses" and not re.search(_LOSS, strange, re.IGNORECASE):
+                raise ConfigError(path, "", f"the header says {strange!r}: powers", "torques in N m, or losses in W")
             raise ConfigError(path, "", f"the header says {strange!r}: {what} in another unit", allowed)
     if chosen == "auto":
         said.append(f"speeds in {named or 'rad/s'}" + (", as the header says" if named else ": guessed"))
@@ -173,12 +209,13 @@ def _torque_first(head: str) -> bool:
 
 def _check_quantity(path: Path | str, header: list[str], quantity: str) -> None:
     """Refuse losses that would be taken for efficiencies."""
-    lost = next((cell for cell in header if re.search("loss|verlust", cell, re.IGNORECASE)), None)
+    lost = next((cell for cell in header if re.search(_LOSS, cell, re.IGNORECASE)), None)
     if lost is not None and quantity == "efficiency":
         raise ConfigError(path, "", f"the header says {lost!r}", "efficiencies, or --quantity loss")
 
 
 def _value(table: Table, line: int, text: str, column: str) -> float:
+    text = text.removesuffix("%").rstrip()
     return math.nan if is_nothing(text) or text.lower() == "inf" else table.number(line, text, column)
 
 

@@ -50,6 +50,7 @@ _MOTOR = (
         _SHAFT,
     ),
     _Bound("peak_torque_nm", "g of this axle alone", 0.01, 5.0, _SHAFT, f"the torque {_ONE_MOTOR}"),
+    _Bound("regeneration_torque_nm", "of peak_torque_nm", 0.0, 1.5, "", f"the torque {_ONE_MOTOR}"),
     _Bound(
         "loss",
         "efficiency at half of peak torque and full power",
@@ -67,9 +68,19 @@ _BRAKE = _Bound(
     "kN m in an N m field?",
     "N mm or a force in N?",
 )
+_INERTIA = _Bound(
+    "inertia_kgm2",
+    "of the car's mass in what this axle turns",
+    3e-4,
+    1.0,
+    "g m2, or kg cm2 in a kg m2 field?",
+    "kg cm2 in a kg m2 field, or a wheel radius in cm?",
+)
+_AIR = _Bound("air_density_kgpm3", "kg/m3", 0.3, 2.0, "g/cm3 in a kg/m3 field?", "")
 _BATTERY = (
     _Bound("discharge_limit_w", _LIMIT, 0.05, 100.0, _KILOWATTS, _KILOWATTS),
     _Bound("charge_limit_w", _LIMIT, 0.005, 100.0, _KILOWATTS, _KILOWATTS),
+    _Bound("cells_in_series", "V of the pack", 5.0, 2000.0, "cells in parallel counted?", "cells in parallel counted?"),
     _Bound("resistance_ohm", _VOLTAGE, 0.0, 1.0, "", "milliohm in an ohm field, or a cell for the pack?"),
     _Bound("ohmic_resistance_ohm", _PLANT, 0.05, 20.0, "a cell for the pack?", "milliohm in an ohm field?"),
     _Bound(
@@ -99,9 +110,12 @@ def check_car(path: Path, params: VehicleParams, key_of: Callable[[str, str], st
         losses = "efficiency_map" if axle.motor.map_loss_w.size else "loss"
         for bound, value in zip(_MOTOR, _motor_values(axle, params.chassis.mass_kg), strict=True):
             _check(path, f"{key_of(name, 'motor')}.{losses if bound.key == 'loss' else bound.key}", bound, value)
+        turning_kg = 2.0 * axle.wheel.inertia_kgm2 / axle.wheel.radius_m**2
+        _check(path, f"{key_of(name, 'wheel')}.{_INERTIA.key}", _INERTIA, turning_kg / params.chassis.mass_kg)
         # A car may have no friction brakes on an axle.
         brake_mps2 = 2.0 * axle.friction_brake.max_torque_nm / axle.wheel.radius_m / params.chassis.mass_kg
         _check(path, f"{key_of(name, 'friction_brake')}.{_BRAKE.key}", _BRAKE, brake_mps2 or 1.0)
+    _check(path, f"chassis.{_AIR.key}", _AIR, params.chassis.air_density_kgpm3 or _AIR.high)  # a vacuum may be meant
     for bound, value in zip(_BATTERY, _battery_values(params), strict=True):
         _check(path, f"battery.{bound.key}", bound, value)
 
@@ -119,6 +133,7 @@ def _motor_values(axle: Axle, mass_kg: float) -> tuple[float, ...]:
         motor.max_power_w / mass_kg,
         radius * motor.max_power_w / motor.peak_torque_nm,
         2.0 * motor.peak_torque_nm / radius / (mass_kg * _GRAVITY_MPS2),
+        motor.regeneration_torque_nm / motor.peak_torque_nm,
         _efficiency(motor),
     )
 
@@ -130,6 +145,7 @@ def _battery_values(params: VehicleParams) -> tuple[float, ...]:
     return (
         battery.discharge_limit_w / power,
         battery.charge_limit_w / power or 1.0,
+        volt,
         battery.resistance_ohm * 4.0 * battery.discharge_limit_w / volt**2,
         (battery.ohmic_resistance_ohm + battery.polarisation_resistance_ohm) / battery.resistance_ohm,
         volt * battery.capacity_ah / params.chassis.mass_kg,

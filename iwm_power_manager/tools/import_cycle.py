@@ -60,7 +60,12 @@ def parser() -> argparse.ArgumentParser:
     table.add_argument("--decimal", choices=("auto", "point", "comma"), default="auto", help="default: %(default)s")
     table.add_argument("--time", default="", metavar="COLUMN", help="default: the first whose name looks like time")
     table.add_argument("--speed", default="", metavar="COLUMN", help="default: the first whose name looks like speed")
-    table.add_argument("--grade", default="", metavar="COLUMN", help="rise over run; default: level road")
+    table.add_argument(
+        "--grade",
+        default="",
+        metavar="COLUMN",
+        help="rise over run; default: one that is called grade, else level road",
+    )
     table.add_argument(
         "--time-unit",
         choices=("auto", "clock", *TIME_UNITS),
@@ -135,7 +140,7 @@ def _import(options: argparse.Namespace) -> None:
     cycle = to_cycle(log, options.gaps, options.max_gap, options.smooth, options.rate)
     raw = to_cycle(log, options.gaps, options.max_gap, 0.0, 0.0)
     numbers = _numbers(options, log, cycle, raw, vehicle)
-    command.write_result(options.output, cycle_text(cycle, bool(options.grade)).encode())
+    command.write_result(options.output, cycle_text(cycle, bool(options.grade or cycle.grade.any())).encode())
     if not options.quiet:
         print(_text(options, log, numbers))
     invented_m = log.across_gaps_m(options.max_gap) if options.gaps == "bridge" else 0.0

@@ -95,6 +95,16 @@ def test_a_column_of_time_that_is_empty_is_the_last_choice(tmp_path, capsys):
     assert "has 0 usable rows: columns: time is 'GPS Time', speed is 'Speed (km/h)'; 10 rows without a value" in error
 
 
+def test_a_column_of_grade_is_taken_and_one_that_looks_like_it_is_said(tmp_path, capsys):
+    rows = [(t, t, 0.02 * (t > 4)) for t in range(10)]
+    for column, words in (("Grade", "grade is 'Grade'"), ("slope %", "'slope %' is left out: --grade takes it")):
+        log = log_of(tmp_path / "log.csv", ("time_s", "speed_mps", column), rows)
+        code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv")
+        assert code == 0
+        assert words in out
+        assert load_cycle(tmp_path / "trip.csv").grade.max() == pytest.approx(0.02 if column == "Grade" else 0.0)
+
+
 def test_a_gap_is_bridged_or_cut_by_choice_and_never_in_silence(tmp_path, capsys):
     keep = (NYCC.time_s < 200) | (NYCC.time_s > 250)
     log = log_of(
@@ -210,6 +220,11 @@ def test_a_trace_the_car_cannot_follow_is_warned_of(tmp_path, capsys):
     [
         ("", "is empty"),
         ("time,speed\n0,0\n", "has 1 usable rows"),
+        ("0,0\n1,1\n2,1\n", "line 1: has no header; allowed: a first line that names the columns"),
+        (
+            "time_s,speed_mps\n" + "".join(f"{t},{min(5 * t, 90)}\n" for t in range(40)),
+            "looks like km/h in the m/s column (--speed",
+        ),
         ("a,b\n0,0\n1,1\n", "has no column that looks like time: name it with --time; allowed: a, b"),
         ("Zeit_s;w\n0;0\n1;1\n", "has no column that looks like speed: name it with --speed; allowed: Zeit_s, w"),
         ("time_s,speed m/s\n0,0\n1,fast\n", "line 3, speed m/s: 'fast' is no number"),

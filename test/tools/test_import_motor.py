@@ -144,6 +144,7 @@ def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys)
         ("w,t,loss W\n1,2,46\n", (), "the header says 'loss W'; allowed: efficiencies, or --quantity loss"),
         ("w,t,loss kW\n1,2,4\n", ("--quantity", "loss"), "'loss kW': losses in another unit; allowed: W"),
         ("rpm,kNm,eta\n1,2,0.4\n", (), "'kNm': torques in another unit; allowed: N m"),
+        ("rpm,Power [kW],eta\n1,2,0.4\n", (), "'Power [kW]': powers; allowed: torques in N m, or losses in W"),
         ("km/h,Nm,eta\n1,2,0.4\n", (), "'km/h': speeds in another unit; allowed: rad/s or rpm: --speed-unit"),
         ("1/s,Nm,eta\n1,2,0.4\n", (), "'1/s': speeds in another unit"),
         ("krpm,Nm,eta\n1,2,0.4\n", (), "'krpm': speeds in another unit"),
@@ -203,6 +204,31 @@ def test_points_on_no_grid_and_a_header_in_percent_are_warned_of(tmp_path, capsy
     assert code == 0
     assert "its points hardly lie on a grid" in err
     assert "efficiencies as fractions of 1, although the header says %" in err
+
+
+def test_a_wrong_digit_and_fractions_among_percents_are_warned_of(tmp_path, capsys):
+    rows = list(points())
+    inner = next(i for i, (w, t, e) in enumerate(rows) if w > 60.0 and t > 40.0 and e > 0.8)
+    table = tmp_path / "sheet.csv"
+    for factor, words in ((0.1, f"{rows[inner][2] / 10:.4g} at"), (1.0 / rows[inner][2], "1 at")):
+        wrong = [(w, t, e * factor if i == inner else e) for i, (w, t, e) in enumerate(rows)]
+        table.write_text("speed_rad_s,torque_nm,efficiency\n" + "".join(f"{w},{t},{e}\n" for w, t, e in wrong))
+        code, _, err = run(capsys, table, "--output", tmp_path / "map.csv", "--quiet")
+        assert code == 0
+        assert err.count("a wrong digit?") == 1
+        assert words in err
+    mixed = "".join(f"{w},{t},{100 * e if t > 5 else e}\n" for w, t, e in rows)
+    table.write_text("speed_rad_s,torque_nm,efficiency\n" + mixed)
+    for options in ((), ("--percent",)):
+        err = run(capsys, table, "--output", tmp_path / "map.csv", "--quiet", *options)[2]
+        assert "are at most 1: fractions of 1 among them?" in err
+
+
+def test_signs_of_percent_stand_behind_numbers(tmp_path, capsys):
+    table = tmp_path / "sheet.csv"
+    table.write_text("rad/s,Nm,eta\n" + "".join(f"{w},{t},{100 * e:.8f} %\n" for w, t, e in points()))
+    assert run(capsys, table, "--output", tmp_path / "map.csv", "--quiet") == (0, "", "")
+    same(tmp_path / "map.csv")
 
 
 def test_speeds_taken_for_torques_are_warned_of(tmp_path, capsys):
