@@ -93,6 +93,7 @@ def test_a_missing_folder_is_a_clear_error(tmp_path):
         ("", "holds no mapping"),
         ("1: 2\n", "1: is no text key"),
         ("a: 2020-13-45\n", "line 1: '2020-13-45' is no timestamp"),
+        ("a:\n\tb: 1\n", "line 2: found character '\\t' that cannot start any token; write spaces for tabs"),
         ("a: 1\nb: {topic: x, field: data[2]}\n", "line 2: expected ',' or '}', but got '['; quote a text with [ ]"),
         ("a: !!python/object/apply:os.system [ls]\n", "could not determine a constructor"),
     ],
