@@ -116,6 +116,12 @@ def read_points(
     most_nm = max((abs(torque) for _, torque in points), default=0.0) / gear
     if most_nm > _MOST_NM:
         doubts.append(f"torques up to {most_nm:g} N m at the motor: {'--down' if layout == 'matrix' else 'unit'}?")
+    return Points(points, said, doubts + _doubtful(points, quantity))
+
+
+def _doubtful(points: dict[tuple[float, float], float], quantity: str) -> list[str]:
+    """What is doubtful about the points themselves."""
+    doubts = []
     known = sorted(value for value in points.values() if value > 0.0)
     if known and known[len(known) // 2] > _TOO_GOOD:
         meant = "losses in kW" if quantity == "loss" else "another quantity"
@@ -124,7 +130,7 @@ def read_points(
     grid = len({speed for speed, _ in points}) * len({torque for _, torque in points})
     if len(points) < _SPARSE * grid:
         doubts.append(f"its points hardly lie on a grid: {len(points)} of {grid}")
-    return Points(points, said, doubts)
+    return doubts
 
 
 def _alone(points: dict[tuple[float, float], float]) -> list[str]:
