@@ -298,7 +298,9 @@ def read_yaml(path: Path | str) -> dict[str, Any]:
         mark = error.problem_mark or error.context_mark
         where = f"line {mark.line + 1}" if mark else ""
         line = "".join(text.split("\n")[mark.line : mark.line + 1]) if mark else ""
-        hint = "; quote a text with [ ]" if _BARE_INDEX.search(line) else "; write spaces for tabs" if "\t" in line else ""
+        hint = (
+            "; quote a text with [ ]" if _BARE_INDEX.search(line) else "; write spaces for tabs" if "\t" in line else ""
+        )
         raise ConfigError(path, where, " ".join((error.problem or "is no YAML").split()) + hint) from None
     except Exception as error:  # noqa: BLE001 - characters that no YAML has, and what else PyYAML fails at
         reason = " ".join(str(error).split()) or type(error).__name__

@@ -117,6 +117,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
+    options.quiet |= options.json == "-"  # nothing else in what another program is to read
     return command.ended("import_cycle", lambda: _import(options))
 
 

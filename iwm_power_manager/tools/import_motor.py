@@ -100,6 +100,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
+    options.quiet |= options.json == "-"  # nothing else in what another program is to read
     return command.ended("import_motor", lambda: _import(options))
 
 

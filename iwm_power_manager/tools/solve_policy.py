@@ -139,6 +139,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
+    options.quiet |= options.json == "-"  # nothing else in what another program is to read
     return ended(
         "solve_policy",
         lambda: _check(options) if options.check else _solve(options),
@@ -148,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 #: What --check takes beside the files.
-_OF_CHECK = {"--check", "--vehicle", "--idle-drive", "--quiet"}
+_OF_CHECK = {"--check", "--vehicle", "--idle-drive", "--json", "--quiet"}
 
 
 def _solve(options: argparse.Namespace) -> int:
@@ -253,7 +254,7 @@ def _check(options: argparse.Namespace) -> int:
     """Verify policy files against a car: identity, integrity, and the bound, computed anew."""
     refuse_without_effect(options, {option: (option in _OF_CHECK, "not with --check") for option in options.given})
     vehicle = load_vehicle(resolve(options.vehicle), options.idle_drive)
-    kept = True
+    rows = []
     for name in options.check:
         path = resolve(name)
         policy = load_policy(path)
@@ -264,14 +265,17 @@ def _check(options: argparse.Namespace) -> int:
         # A cost-to-go within b of the optimum has a residual of at most (1 + gamma) b.
         claimed = policy.bound_j * (1.0 + policy.problem.discount) / (1.0 - policy.problem.discount)
         good = bound <= claimed + 1e-9 * float(np.max(np.abs(cost)))
-        kept = kept and good
-        if not options.quiet or not good:
+        numbers = {"friction": policy.friction, "checksum": policy.checksum, "claimed_j": policy.bound_j}
+        rows.append({"policy": str(path), **numbers, "proven_j": bound, "keeps_its_bound": bool(good)})
+        if not options.quiet or (not good and options.json != "-"):
             verdict = "ok" if good else "does NOT keep its bound"
             print(
                 f"{path}: {verdict}; friction {policy.friction:g}, {policy.vehicle_name}, {policy.checksum[:12]}, "
                 f"claims {policy.bound_j:.3g} J, Bellman residual proves {bound:.3g} J"
             )
-    return SOLVED if kept else UNSOLVED
+    if options.json:
+        write_json(options.json, rows)
+    return SOLVED if all(row["keeps_its_bound"] for row in rows) else UNSOLVED
 
 
 def demand_warnings(chain: DemandChain, dt_s: float) -> list[str]:

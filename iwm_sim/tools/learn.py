@@ -122,6 +122,7 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = parser().parse_args(arguments)
+    options.quiet |= options.json == "-"  # nothing else in what another program is to read
     return ended("learn_policy", lambda: _learn(options), options.output, quiet=options.quiet)
 
 

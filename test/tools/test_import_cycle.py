@@ -62,6 +62,8 @@ def test_semicolons_decimal_commas_clocks_and_empty_cells_are_read(tmp_path, cap
     assert "1 rows without a value left out" in out
     assert load_cycle(tmp_path / "trip.csv").speed_mps.tolist() == pytest.approx([0, 1, 2, 3, 5, 6, 7, 8, 9])
     assert json.loads((tmp_path / "n.json").read_text())["speed_unit"] == "km/h"
+    out = run(capsys, log, "--output", tmp_path / "trip.csv", "--json", "-")[1]
+    assert json.loads(out) == json.loads((tmp_path / "n.json").read_text())
 
 
 @pytest.mark.parametrize("units", ["s;km/h", "[s];[km/h]", "(s);(km/h)"])

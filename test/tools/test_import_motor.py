@@ -57,6 +57,8 @@ def test_a_list_in_rpm_and_percent(tmp_path, capsys):
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((tmp_path / "map.json").read_text())["best_efficiency"]["speed_radps"] == pytest.approx(150.0)
     same(tmp_path / "map.csv")
+    out = run(capsys, table, "--output", tmp_path / "map.csv", "--json", "-")[1]
+    assert json.loads(out) == json.loads((tmp_path / "map.json").read_text())
 
 
 @pytest.mark.parametrize("down", ["speed", "torque"])

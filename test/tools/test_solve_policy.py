@@ -187,6 +187,9 @@ def test_check_accepts_what_was_solved_and_nothing_else(grid, tmp_path, capsys):
     assert _solve(grid, "--friction", 0.5, "--output", path, "--quiet") == 0
     assert _run("--vehicle", "jalalmaab_2015", "--check", path) == 0
     assert f"{path}: ok; friction 0.5" in capsys.readouterr().out
+    assert _run("--vehicle", "jalalmaab_2015", "--check", path, "--json", "-") == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert (row["friction"], row["keeps_its_bound"], row["checksum"]) == (0.5, True, load_policy(path).checksum)
     assert _run("--vehicle", "jalalmaab_2015", "--idle-drive", "enabled", "--check", path) == 2
     assert "was solved for" in capsys.readouterr().err
 
