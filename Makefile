@@ -19,7 +19,8 @@ demo: setup-run  ## Drive the New York City Cycle over DDS, record it, show the 
 	@$(BIN)/demo $(ARGS)
 
 test: lint type  ## Linters, types and all tests (20 min)
-	@$(BIN)/python -m pytest $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile -m "not nightly and not processes" $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest -m "processes and not nightly" $(PYTEST_ARGS)
 
 ##@ Results
 .PHONY: policies study unseen docs-numbers roads bench bench-peers
