@@ -15,17 +15,18 @@ import os
 import shutil
 import sqlite3
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 
 from iwm_power_manager.bags import mcap_source, reader
 from iwm_power_manager.bags.limits import PACKED, check_exists, regular_file
+from iwm_power_manager.bags.losses import Losses
 from iwm_power_manager.bags.mcap_file import McapFile
 from iwm_power_manager.bags.metadata import (
     FileSpan,
@@ -87,7 +88,7 @@ class Recovery(NamedTuple):
     ----------
     path : the bag
     files : file by file
-    missing : by topic, messages that the publisher's counter shows to be missing between the first and the last one
+    missing : by topic of one publisher, messages that its counter shows to be missing between the first and the last
     start_ns, end_ns : log times the bag spans now
     metadata_written : `metadata.yaml` was missing or did not fit
     """
@@ -133,12 +134,12 @@ def recover(path: Path | str) -> Recovery:
         files: list[_File] = []
         left_out: list[FileRecovery] = []
         names = _names(path)
-        missing, last = Counter[str](), dict[str, int]()
+        losses = defaultdict[str, Losses](Losses)
         for name in names:
             try:
                 regular_file(name, folder)
                 name.name.encode()
-                files.append(_File(name, stack, missing, last))
+                files.append(_File(name, stack, losses))
             except UnicodeEncodeError:
                 why = f"{name}: its name is no UTF-8 text, which metadata.yaml could not hold: rename it"
                 left_out.append(FileRecovery(name.name, False, 0, why))
@@ -161,7 +162,7 @@ def recover(path: Path | str) -> Recovery:
         return Recovery(
             path,
             [file.report for file in files] + left_out,
-            dict(+missing),
+            {topic: found.count for topic, found in losses.items() if found.count},
             min((file.seen.start_ns for file in files if file.seen.count), default=0),
             max(file.seen.end_ns for file in files),
             stale,
@@ -188,10 +189,10 @@ def _names(path: Path) -> list[Path]:
 class _Seen:
     """All messages of a file, read and counted: by channel, in all, the first and the last, compressed one by one.
 
-    By topic, `last` is the publisher's number, from file to file, and `missing` are those left out before it.
+    What is missing by the publishers' numbers goes to `losses`, by topic, from file to file.
     """
 
-    def __init__(self, source: mcap_source.Source, missing: Counter[str], last: dict[str, int]) -> None:
+    def __init__(self, source: mcap_source.Source, losses: defaultdict[str, Losses]) -> None:
         self.source = source
         self.topics = source.topics
         self.counts: Counter[int] = Counter()
@@ -203,9 +204,7 @@ class _Seen:
             start_ns, self.end_ns = min(start_ns, log_time), max(self.end_ns, log_time)
             self.compression = self.compression or PACKED.get(data[:4], "")
             if sequence and own and channel in self.topics:
-                name = self.topics[channel].name
-                missing[name] += max(sequence - last.get(name, sequence) - 1, 0)
-                last[name] = sequence
+                losses[self.topics[channel].name].take(sequence)
         self.count = self.counts.total()
         self.start_ns = start_ns if self.count else 0
 
@@ -213,13 +212,13 @@ class _Seen:
 class _File:
     """A data file and what becomes of it: what is wrong with it, and what was found, at last in the rebuilt one."""
 
-    def __init__(self, path: Path, stack: ExitStack, *gaps: Any) -> None:
+    def __init__(self, path: Path, stack: ExitStack, losses: defaultdict[str, Losses]) -> None:
         self._stack = stack
         self.path = path
         self.is_compressed = path.suffix in reader.COMPRESSED_SUFFIXES
         self._temporary: Path | None = None
         opened, problem = _opened(path, stack)
-        self.seen = _Seen(reader.open_source(opened, path, stack), *gaps)
+        self.seen = _Seen(reader.open_source(opened, path, stack), losses)
         self.is_sqlite = isinstance(self.seen.source, SqliteSource)
         found = self.seen.source.damage[:3]
         if self.seen.counts.keys() - self.seen.topics.keys():
@@ -239,7 +238,7 @@ class _File:
             temporary.unlink(missing_ok=True)
             self._stack.callback(temporary.unlink, missing_ok=True)
             copy = _Copy(self.seen.source, temporary)
-            made = _Seen(reader.open_source(temporary, target, self._stack), Counter(), {})
+            made = _Seen(reader.open_source(temporary, target, self._stack), defaultdict(Losses))
         if made.source.damage or made.count < self.seen.count:
             raise BagError(
                 f"{temporary}: holds {made.count} of {self.seen.count} messages; the original is left as it is"

@@ -23,6 +23,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
+from iwm_power_manager.bags.losses import Losses
 from iwm_power_manager.bags.metadata import INFINITE
 from iwm_power_manager.ros.intake import Unattended, never_called
 from iwm_power_manager.ros.messages import message_class
@@ -57,7 +58,18 @@ class FoundTopic(NamedTuple):
 class _Topic:
     """A subscription and what was counted on it."""
 
-    __slots__ = ("count", "last", "lost", "missed", "msg_class", "name", "number", "request", "single", "subscription")
+    __slots__ = (
+        "count",
+        "losses",
+        "lost",
+        "missed",
+        "msg_class",
+        "name",
+        "number",
+        "request",
+        "single",
+        "subscription",
+    )
 
     def __init__(self, number: int, name: str, msg_class: type) -> None:
         self.number = number
@@ -66,9 +78,9 @@ class _Topic:
         self.subscription: Any = None  # until `_subscribe`
         self.request: tuple[ReliabilityPolicy, DurabilityPolicy] | None = None
         self.single = True  # one publisher: its counter shows what is missing
-        self.last = 0  # its last counter
         self.count = 0
-        self.lost = 0  # missing between the first and the last message
+        self.losses = Losses()
+        self.lost = 0  # missing between the first and the last message while there was one publisher
         self.missed = 0  # sent before the first message that arrived
 
 
@@ -127,7 +139,7 @@ class RawSubscriptions:
                     found.append(_found(topic, types[0], publishers))
                 else:
                     self._subscribe(topic, publishers)
-                    topic.single = topic.single and len(publishers) == 1
+                topic.single = topic.single and len(publishers) == 1
             except ValueError as error:
                 if self._refused.get(name) != str(error):
                     self._refused[name] = str(error)
@@ -155,12 +167,15 @@ class RawSubscriptions:
 
         Losses are seen by the publisher's counter; with more than one publisher on a topic they cannot be told.
         """
-        return {topic.name: (topic.count, topic.lost, topic.missed) for topic in list(self._topics.values())}
+        return {
+            topic.name: (topic.count, min(topic.lost, topic.losses.count), topic.missed)
+            for topic in list(self._topics.values())
+        }
 
     def _take_topic(self, topic: _Topic, batch: list[Taken]) -> None:
         handle = topic.subscription.handle
         msg_class, number = topic.msg_class, topic.number
-        last, lost = topic.last, topic.lost
+        losses = topic.losses
         before = len(batch)
         with handle:
             take = handle.take_message
@@ -170,18 +185,16 @@ class RawSubscriptions:
                     break
                 data, info = taken
                 sequence = info["publication_sequence_number"] or 0
-                if sequence > last + 1:
-                    if last:
-                        lost += sequence - last - 1
-                    else:
-                        topic.missed += sequence - 1
-                last = sequence
+                if sequence == losses.last + 1:
+                    losses.last = sequence
+                else:
+                    topic.missed += 0 if losses.last else max(sequence - 1, 0)
+                    losses.take(sequence)
                 received = info["received_timestamp"] or time.time_ns()
                 batch.append((number, received, data, info["source_timestamp"] or received, sequence & _COUNTER))
         topic.count += len(batch) - before
-        topic.last = last
         if topic.single:
-            topic.lost = lost
+            topic.lost = losses.count
 
     def _subscribe(self, topic: _Topic, publishers: Sequence[TopicEndpointInfo]) -> None:
         """Subscribe with a request every publisher can meet; again, if a newcomer cannot meet the present one."""

@@ -356,6 +356,30 @@ def test_diagnostics_report_counts_and_losses(
     assert process.end()[0] == 0
 
 
+def test_of_two_publishers_of_a_topic_nothing_is_lost(
+    tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
+) -> None:
+    """The one has sent hundreds of messages before the other begins: their counters are far apart."""
+    first, second = (peer.node.create_publisher(Float64, "/numbers", RELIABLE) for _ in range(2))
+    for _ in range(300):
+        first.publish(Float64(data=1.0))
+    heard: list[bool] = []
+    peer.node.create_subscription(Bool, "/recorder/ready", lambda message: heard.append(message.data), LATCHED)
+    process = recorder(tmp_path / "bag", "topics:=[/numbers]", "wait_for:=[/numbers]")
+
+    def ready() -> bool:
+        for _ in range(5):
+            first.publish(Float64(data=1.0))
+            second.publish(Float64(data=2.0))
+        return True in heard
+
+    peer.until(ready, "recorder ready")
+    assert second.wait_for_all_acked(Duration(seconds=PATIENCE_S))
+    code, error = process.end()
+    assert code == 0
+    assert "dropped 0, lost on the way 0" in error
+
+
 def test_a_failing_disk_ends_the_node_with_one_line(
     tmp_path: Path, peer: Peer, recorder: Callable[..., RecorderProcess]
 ) -> None:
