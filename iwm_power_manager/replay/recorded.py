@@ -41,6 +41,8 @@ _STANDING = 10
 _SLOW = 100
 #: A stamp this far from the one before belongs to a clock that was set in between, unless the log shows such a pause.
 _SET_NS = 86_400 * 10**9
+#: A stamp that is the same for longer, by the log, while the car drives on, stands.
+_STANDS_NS = 10**9
 
 FloatArray = NDArray[np.float64]
 
@@ -254,7 +256,8 @@ def read_signal(
     """Demand and speed of a bag, at the times of the demands.
 
     A demand carries no stamp. Its time is that of the speed it came with: in a lock-step run, recorded faster than
-    real time, the clock on the wall says nothing. Where speeds have no stamps, the log time counts.
+    real time, the clock on the wall says nothing. Where speeds have no stamps, or these stand, the log time counts;
+    where stamps start again, as of a simulator that was, the time goes on.
 
     Parameters
     ----------
@@ -287,7 +290,8 @@ def read_signal(
     if not rows:
         raise BagError(f"{bag}: holds no power demand with a speed before it")
     log_times, stamps, demands, speeds = map(np.array, zip(*rows, strict=True))
-    time_ns = _continued(_times(log_times, stamps), np.diff(log_times) < -SET_BACK_NS)
+    time_ns, said = _times(log_times, stamps, np.column_stack((demands, speeds)))
+    damage += said
     keep = _advancing(time_ns)
     if behind := np.count_nonzero(time_ns < np.maximum.accumulate(time_ns)):
         damage.append(f"{behind} of {time_ns.size} demands are left out: their stamps are behind those before them")
@@ -328,6 +332,43 @@ def check_signals(reader: BagReader, mapping: SignalMapping, stream: SignalStrea
         raise BagError(f"{reader.path}: {problem}; other topics are named by a signals file: --mapping")
 
 
+def _times(
+    log_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64], values: FloatArray
+) -> tuple[NDArray[np.int64], list[str]]:
+    """Times of the demands: stamps if speeds come about as often as demands, else log times; what is to be said of it.
+
+    Where a clock was set back the time goes on.
+    """
+    set_back = np.diff(log_ns) < -SET_BACK_NS
+    logged = _continued(log_ns, set_back)
+    again = _started_again(stamp_ns, logged)
+    stamped = _continued(stamp_ns, set_back | again)
+    if np.any(stamp_ns < 0) or 2 * np.unique(stamped).size < stamped.size:
+        return logged, []
+    stood_ns = _stood_ns(stamped, logged, values)
+    if stood_ns > _STANDS_NS:
+        return logged, [f"the stamps of the speed stand still for {1e-9 * stood_ns:.1f} s: log times are used"]
+    count = np.count_nonzero(again & ~set_back)
+    said = f"the stamps start again {count} time(s), as of a simulator that was restarted: the time goes on there"
+    return stamped, [said] if count else []
+
+
+def _started_again(stamp_ns: NDArray[np.int64], log_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Where stamps go back for good: not those of two sources, which go back and forth."""
+    steps = np.diff(stamp_ns)
+    back, forth = steps < -SET_BACK_NS, steps - np.diff(log_ns) >= SET_BACK_NS
+    return back & (2 * np.count_nonzero(forth) < np.count_nonzero(back))
+
+
+def _stood_ns(stamp_ns: NDArray[np.int64], log_ns: NDArray[np.int64], values: FloatArray) -> int:
+    """The longest time, by the log, over which stamps were the same and other values were not."""
+    first = np.flatnonzero(np.diff(stamp_ns, prepend=stamp_ns[0] - 1))
+    behind = np.append(first[1:], stamp_ns.size)
+    lasted = log_ns[behind - 1] - log_ns[first]
+    long = np.flatnonzero(lasted > _STANDS_NS)
+    return max((int(lasted[i]) for i in long if np.ptp(values[first[i] : behind[i]], axis=0).any()), default=0)
+
+
 def _continued(time_ns: NDArray[np.int64], was_set: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Times as of a clock that was not set back: where it was, one more step of the usual length."""
     steps = np.diff(time_ns)
@@ -340,11 +381,3 @@ def _advancing(time_ns: NDArray[np.int64]) -> NDArray[np.intp]:
     forward = np.flatnonzero(time_ns >= np.maximum.accumulate(time_ns))
     last = np.append(np.diff(time_ns[forward]) > 0, True)
     return forward[last]
-
-
-def _times(log_ns: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Times of the demands: stamps if speeds come about as often as demands, else log times."""
-    stamped = stamp_ns[stamp_ns >= 0]
-    if stamped.size == stamp_ns.size and 2 * np.unique(stamped).size >= stamp_ns.size:
-        return stamp_ns
-    return log_ns

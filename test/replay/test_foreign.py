@@ -176,6 +176,53 @@ def test_demands_whose_stamps_go_back_are_not_left_out_in_silence(tmp_path: Path
     assert any("demands are left out: their stamps are behind those before them" in line for line in found.damage)
 
 
+@pytest.mark.parametrize("starts", [1, 2])
+def test_what_follows_a_simulator_that_was_started_again_is_learned_from(
+    tmp_path: Path, mapping: Path, starts: int
+) -> None:
+    lasts_ns = COUNT * foreign.PERIOD_NS
+    entries = drive((starts + 1) * COUNT, stamp=lambda log_ns: 10**9 + (log_ns - foreign.START_NS) % lasts_ns)
+    found = read_signal(write_bag(tmp_path / "bag", entries), load_mapping(mapping))
+    assert found.time_s == pytest.approx([0.02 * i for i in range((starts + 1) * COUNT)])
+    assert found.damage == [
+        f"the stamps start again {starts} time(s), as of a simulator that was restarted: the time goes on there"
+    ]
+
+
+def test_stamps_of_two_clocks_are_not_taken_for_restarts(tmp_path: Path, mapping: Path) -> None:
+    entries = drive(stamp=lambda log_ns: log_ns - 5 * 10**9 * (log_ns // foreign.PERIOD_NS % 5 == 3))
+    found = read_signal(write_bag(tmp_path / "bag", entries), load_mapping(mapping))
+    assert found.time_s[-1] == pytest.approx((COUNT - 1) * 0.02)
+    assert found.damage == [f"20 of {COUNT} demands are left out: their stamps are behind those before them"]
+
+
+@pytest.mark.parametrize("stands", [(0.3, 0.55), (0.5, 1.0)], ids=["in between", "to the end"])
+def test_a_drive_whose_stamps_stand_for_a_while_is_learned_from_at_log_times(
+    tmp_path: Path, mapping: Path, stands: tuple[float, float]
+) -> None:
+    first, behind = (foreign.START_NS + int(share * 300) * foreign.PERIOD_NS for share in stands)
+    entries = drive(300, stamp=lambda log_ns: first if first < log_ns < behind else log_ns)
+    found = read_signal(write_bag(tmp_path / "bag", entries), load_mapping(mapping))
+    assert found.time_s == pytest.approx([0.02 * i for i in range(300)])
+    (line,) = found.damage
+    assert line.endswith("s: log times are used")
+    assert "the stamps of the speed stand still for" in line
+
+
+def test_where_simulated_time_stood_while_nothing_changed_stamps_count(tmp_path: Path, mapping: Path) -> None:
+    """A lock-step drive that waited: the same set was sent again and again."""
+    entries = drive()
+    (_, _, speed), (_, _, demand), (_, _, wheels) = entries[:3]
+    waited = [
+        (foreign.START_NS - i * foreign.PERIOD_NS, number, data)
+        for i in range(100, 0, -1)
+        for number, data in enumerate((speed, demand, wheels))
+    ]
+    found = read_signal(write_bag(tmp_path / "bag", waited + entries), load_mapping(mapping))
+    assert found.time_s == pytest.approx([0.02 * i for i in range(COUNT)])
+    assert found.damage == []
+
+
 def test_demands_of_one_time_are_not_left_out_in_silence(tmp_path: Path, mapping: Path) -> None:
     entries = [(foreign.START_NS, n, data) for _, n, data in drive(stamp=lambda _: 0)]
     found = read_signal(write_bag(tmp_path / "bag", entries), load_mapping(mapping))
