@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -162,26 +161,46 @@ def apart(shown: float, rolled: float, radius_m: float, least: float = _APART) -
     return f"speed is {ratio:.3g} times what wheel_speed and a radius of {radius_m:g} m give: {words}?"
 
 
-def demand_apart(demanded_j: Sequence[float], gained_j: Sequence[float]) -> str:
-    """A line, if a demand's sign or unit cannot be the one it was read with; "" else.
+class Energies:
+    """What was asked for, and how the car's kinetic energy changed, second by second."""
 
-    Parameters
-    ----------
-    demanded_j, gained_j : second by second, what was asked for and how the car's kinetic energy changed
-    """
-    if len(demanded_j) < _LEAST_SECONDS:
-        return ""
-    (demand, both), (_, gain) = np.cov(demanded_j, gained_j)
-    if not demand or not gain or both**2 < _EXPLAINS**2 * demand * gain:
-        return ""
-    if both < 0.0:
-        return "the car slows down where power_demand drives, and speeds up where it brakes: is its sign wrong?"
-    ratio = both / demand
-    if ratio < _TIMES_DEMAND:
-        return ""
-    meant = [unit for times, unit in _POWERS.items() if times / 2.0 < ratio < times]
-    words = f"is it in {' or '.join(meant)}" if meant else "another unit, or another car"
-    return f"the car gains {ratio:.3g} times the energy that power_demand asks for: {words}?"
+    def __init__(self, mass_kg: float) -> None:
+        self._half_kg = 0.5 * mass_kg
+        self._demanded_j: list[float] = []
+        self._gained_j: list[float] = []
+        self.cut()
+
+    def cut(self) -> None:
+        """Begin a second anew, as after a pause."""
+        self._lasts_s = self._asked_j = 0.0
+        self._before_mps: float | None = None
+
+    def add(self, speed_mps: float, demand_w: float, dt_s: float) -> None:
+        """One step: its demand, its speed and how long it lasts."""
+        before = self._before_mps = speed_mps if self._before_mps is None else self._before_mps
+        self._lasts_s += dt_s
+        self._asked_j += demand_w * dt_s
+        if self._lasts_s >= 1.0:
+            self._demanded_j.append(self._asked_j)
+            self._gained_j.append(self._half_kg * (speed_mps**2 - before**2))
+            self.cut()
+            self._before_mps = speed_mps
+
+    def apart(self) -> str:
+        """A line, if the demand's sign or unit cannot be the one it was read with; "" else."""
+        if len(self._demanded_j) < _LEAST_SECONDS:
+            return ""
+        (demand, both), (_, gain) = np.cov(self._demanded_j, self._gained_j)
+        if not demand or not gain or both**2 < _EXPLAINS**2 * demand * gain:
+            return ""
+        if both < 0.0:
+            return "the car slows down where power_demand drives, and speeds up where it brakes: is its sign wrong?"
+        ratio = both / demand
+        if ratio < _TIMES_DEMAND:
+            return ""
+        meant = [unit for times, unit in _POWERS.items() if times / 2.0 < ratio < times]
+        words = f"is it in {' or '.join(meant)}" if meant else "another unit, or another car"
+        return f"the car gains {ratio:.3g} times the energy that power_demand asks for: {words}?"
 
 
 def hint(time_s: FloatArray, speed_mps: FloatArray) -> str:

@@ -23,7 +23,7 @@ from iwm_power_manager.control.inputs import ValueLimits, Violation, check_value
 from iwm_power_manager.control.monitor import BatteryReading, JointReading, SpeedReading
 from iwm_power_manager.control.thresholds import RECORDED, input_limits
 from iwm_power_manager.errors import BagError, ConfigError
-from iwm_power_manager.mdp.demand import Source, signal_source
+from iwm_power_manager.mdp.demand import MAX_GAP_S, Source, signal_source
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.share import resolve
@@ -32,6 +32,7 @@ from iwm_power_manager.signals.cdr import UnreadableError
 from iwm_power_manager.signals.contract import WHEEL_NAMES
 from iwm_power_manager.signals.mapping import DEMANDS, PEDALS, SignalMapping, load_mapping, topic_named
 from iwm_power_manager.signals.types import Types, types_of
+from iwm_power_manager.trace_units import Energies
 from iwm_power_manager.vehicle import Vehicle
 
 #: Messages from a bag's start that show whether its stamps advance, and how many may have the same one.
@@ -84,6 +85,17 @@ class RecordedDrive(NamedTuple):
     def source(self, name: str, problem: Problem, weight: float) -> Source:
         """The drive as a source of demand for the solver."""
         return signal_source(name, self.time_s, self.power_demand_w, problem.dt_s, weight, self.speed_mps)
+
+    def demand_apart(self, mass_kg: float) -> str:
+        """A line, if the demand cannot have moved a car of this mass as recorded; "" else."""
+        energies = Energies(mass_kg)
+        energies.add(float(self.speed_mps[0]), 0.0, 0.0)
+        steps = np.diff(self.time_s)
+        for demand_w, speed_mps, dt_s in zip(self.power_demand_w[:-1], self.speed_mps[1:], steps, strict=True):
+            if dt_s > MAX_GAP_S:
+                energies.cut()
+            energies.add(float(speed_mps), float(demand_w), float(dt_s) * (dt_s <= MAX_GAP_S))
+        return energies.apart()
 
 
 class SignalStream:
@@ -313,7 +325,8 @@ def read_drives(
     drives = [(path, read_signal(path, known, vehicle.params)) for path in bags]
     for path, drive in drives:
         bad = [f"{drive.bad_messages} bad messages left out"] if drive.bad_messages else []
-        for line in (*drive.damage, *bad):
+        unlike = drive.demand_apart(vehicle.params.chassis.mass_kg)
+        for line in (*drive.damage, *bad, *([unlike] if unlike else [])):
             print(f"{command}: warning: {path}: {line}", file=sys.stderr)
     return [(Path(path).name, drive) for path, drive in drives]
 

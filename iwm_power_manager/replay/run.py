@@ -28,7 +28,7 @@ from iwm_power_manager.signals.contract import POWER_MANAGER_STATE as STATE
 from iwm_power_manager.signals.mapping import SignalMapping, topic_named
 from iwm_power_manager.signals.readings import joint_state_writer
 from iwm_power_manager.signals.types import definition_of
-from iwm_power_manager.trace_units import apart, demand_apart
+from iwm_power_manager.trace_units import Energies, apart
 
 #: How the state's topic ends, whatever its node is called.
 _STATE_OF_ANY = "/state"
@@ -66,7 +66,7 @@ class Replay:
         self._radius_m = plan.vehicle.params.front.wheel.radius_m
         self._shown_mps = self._rolled_mps = 0.0  # sums of the speed, and of the wheels' rims
         self._along = 0.0  # of their product: below 0 where they have opposite signs
-        self._energy = _Energy(plan.vehicle.params.chassis.mass_kg)
+        self._energies = Energies(plan.vehicle.params.chassis.mass_kg)
         state = state_topic(bag)
         exact = state is not None and first_message(bag, state) is not None
         report = self._report = ReplayReport([*plan.notes], exact)
@@ -131,7 +131,7 @@ class Replay:
         if self._along < 0.0:
             return ["speed and wheel_speed are of opposite signs in most steps: is the sign of one of them wrong?"]
         found = apart(self._shown_mps, self._rolled_mps, self._radius_m)
-        found = found or demand_apart(self._energy.demanded_j, self._energy.gained_j)
+        found = found or self._energies.apart()
         return [found] if found else []
 
     def _find_commands(self, mapping: SignalMapping, tolerance: float) -> None:
@@ -163,31 +163,10 @@ class Replay:
         self._rolled_mps += abs(rolled_mps)
         self._along += values[0] * rolled_mps
         if not self._report.exact:
-            self._energy.add(values[_SPEED], values[_DEMAND], values[_DT])
+            self._energies.add(values[_SPEED], values[_DEMAND], values[_DT])
         for command in self._commands.values():
             command.recomputed(step)
         self._state_comparer.recomputed(step.stamp_ns, step.log_time_ns, DECIDED_NAMES, tuple(values[DECIDED]))
-
-
-class _Energy:
-    """What was asked for, and how the car's kinetic energy changed, second by second."""
-
-    def __init__(self, mass_kg: float) -> None:
-        self._half_kg = 0.5 * mass_kg
-        self.demanded_j: list[float] = []
-        self.gained_j: list[float] = []
-        self._lasts_s = self._asked_j = 0.0
-        self._before_mps: float | None = None
-
-    def add(self, speed_mps: float, demand_w: float, dt_s: float) -> None:
-        """One step."""
-        before = self._before_mps = speed_mps if self._before_mps is None else self._before_mps
-        self._lasts_s += dt_s
-        self._asked_j += demand_w * dt_s
-        if self._lasts_s >= 1.0:
-            self.demanded_j.append(self._asked_j)
-            self.gained_j.append(self._half_kg * (speed_mps**2 - before**2))
-            self._lasts_s, self._asked_j, self._before_mps = 0.0, 0.0, speed_mps
 
 
 class ReplayOutput:

@@ -19,11 +19,13 @@ from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.errors import BagError
 from iwm_power_manager.exit_codes import BAD_INPUT, DONE
 from iwm_power_manager.replay.plan import Choice, make_plan
-from iwm_power_manager.replay.recorded import read_signal
+from iwm_power_manager.replay.recorded import read_drives, read_signal
 from iwm_power_manager.replay.run import Replay
 from iwm_power_manager.replay.what_if import what_if
+from iwm_power_manager.share import share_path
 from iwm_power_manager.signals.mapping import load_mapping
 from iwm_power_manager.tools.replay import main
+from iwm_power_manager.vehicle import load_vehicle
 
 FORKED = f"geometry_msgs/Twist twist\n{LINE}\nMSG: geometry_msgs/Twist\nfloat64 x\n"
 
@@ -249,7 +251,7 @@ def test_a_speed_against_the_wheels_is_said(tmp_path: Path, mapping: Path) -> No
     ],
 )
 def test_a_demand_that_cannot_have_moved_the_car_is_said(
-    tmp_path: Path, mapping: Path, times: float, line: str
+    tmp_path: Path, mapping: Path, times: float, line: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The car of 850 kg is pushed and braked by turns of four seconds, and asks for that and its road load."""
     entries: list[foreign.Entry] = []
@@ -264,9 +266,13 @@ def test_a_demand_that_cannot_have_moved_the_car_is_said(
             (log_ns + 2, 2, foreign.joints(log_ns, [speed / 0.33] * 4)),
         ]
         speed += acceleration * foreign.PERIOD_NS * 1e-9
-    report, _ = replayed(write_bag(tmp_path / "bag", entries), mapping)
+    bag = write_bag(tmp_path / "bag", entries)
+    report, _ = replayed(bag, mapping)
     assert report.notes == [] if not line else report.notes[0].endswith(line)
     assert len(report.notes) == bool(line)
+    read_drives([str(bag)], str(mapping), load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")), "learn")
+    said = capsys.readouterr().err
+    assert said == "" if not line else said.startswith("learn: warning: ") and said.endswith(f"{line}\n")
 
 
 def test_why_wheel_speeds_are_not_believed_is_said(tmp_path: Path, mapping: Path) -> None:
