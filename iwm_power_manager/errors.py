@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from iwm_power_manager.exit_codes import BAD_INPUT, FAILED
+from iwm_power_manager.exit_codes import BAD_INPUT, CANNOT_TELL, FAILED
 
 #: No message gets longer: a hostile file must not fill a terminal or a log.
 MAX_MESSAGE = 1000
@@ -95,6 +95,12 @@ class PolicyError(IwmError):
 
 class BagError(IwmError):
     """A bag cannot be read or written."""
+
+
+class NoAnswerError(BagError):
+    """A bag can be read, and does not have what the answer would need."""
+
+    exit_code = CANNOT_TELL
 
 
 @contextmanager

@@ -40,7 +40,7 @@ from iwm_power_manager.bags.metadata import (
 )
 from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.bags.writer import LIBRARY, announce, write_metadata
-from iwm_power_manager.errors import BagError, system_errors
+from iwm_power_manager.errors import BagError, NoAnswerError, system_errors
 from iwm_power_manager.files import sync_folder
 
 _DAMAGED = ".damaged"
@@ -100,9 +100,14 @@ class Recovery(NamedTuple):
     end_ns: int
     metadata_written: bool
 
+    @property
+    def message_count(self) -> int:
+        """Messages in the bag now."""
+        return sum(file.message_count for file in self.files)
+
     def lines(self) -> list[str]:
         """The report for the user."""
-        total = sum(file.message_count for file in self.files)
+        total = self.message_count
         span = (self.end_ns - self.start_ns) * 1e-9
         out = [f"{self.path}: {total} messages over {span:.3f} s in {len(self.files)} file(s)"]
         for file in self.files:
@@ -126,7 +131,8 @@ def recover(path: Path | str) -> Recovery:
     Raises
     ------
     BagError
-        There is no such bag, nothing in it can be read, or there is no room for the rebuilt file.
+        There is no such bag, nothing in it can be read, or there is no room for the rebuilt file; `NoAnswerError` if
+        its files were cut off within their first bytes.
     """
     path = Path(path)
     folder = path if os.path.isdir(path) else None
@@ -146,7 +152,8 @@ def recover(path: Path | str) -> Recovery:
             except BagError as error:
                 left_out.append(FileRecovery(name.name, False, 0, str(error)))
         if not files:
-            raise BagError(f"{left_out[0].damage}; nothing to recover")
+            kind = NoAnswerError if all(map(_just_begun, names)) else BagError
+            raise kind(f"{left_out[0].damage}; nothing to recover")
         information, problem = read_metadata(path) if folder else ({}, "none")
         fits = not (problem or left_out) and reader.listed_files(information).keys() == {name.name for name in names}
         fits = fits and not miscounted(information, topic_counts(file.seen for file in files))
@@ -184,6 +191,15 @@ def _names(path: Path) -> list[Path]:
     if not names:
         raise BagError(f"{path}: holds no .mcap or .db3 file")
     return names
+
+
+def _just_begun(path: Path) -> bool:
+    """Whether a file was cut off within its first bytes, or is empty."""
+    with suppress(BagError, OSError):
+        regular_file(path)
+        with path.open("rb") as file:
+            return mcap_source.MAGIC.startswith(file.read(len(mcap_source.MAGIC)))
+    return False
 
 
 class _Seen:

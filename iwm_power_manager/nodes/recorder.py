@@ -38,7 +38,7 @@ from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.bags.writer import Sample, WriterOptions
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import BagError, IwmError, one_line
-from iwm_power_manager.exit_codes import DONE
+from iwm_power_manager.exit_codes import CANNOT_TELL, DONE
 from iwm_power_manager.exit_codes import FAILED as EXIT_FAILED
 from iwm_power_manager.files import content_sha256
 from iwm_power_manager.ros import ending
@@ -411,7 +411,8 @@ examples:
   What a power cut left:
     recorder --recover drive_01
 
-{EXIT_CODES}
+{EXIT_CODES}, 3 what --recover was given
+holds no message
 """
 
 
@@ -433,10 +434,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _recover(bags: Sequence[str]) -> int:
+    """Recover bags; returns the exit code, of the last one that was refused or has no message."""
     code = DONE
     for bag in bags:
         try:
-            print("\n".join(map(one_line, recover(bag).lines())))
+            found = recover(bag)
+            print("\n".join(map(one_line, found.lines())))
+            code = code if found.message_count else CANNOT_TELL
         except IwmError as error:
             print(f"recorder: {error}", file=sys.stderr)
             code = error.exit_code

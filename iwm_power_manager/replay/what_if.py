@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.control.record import DECIDED, command_of, measurement_of
 from iwm_power_manager.control.types import Measurement, Wheels
-from iwm_power_manager.errors import BagError
+from iwm_power_manager.errors import BagError, NoAnswerError
 from iwm_power_manager.model.battery import chemical_power_w
 from iwm_power_manager.model.motor import electrical_power_w, idle_drag_nm, regeneration_limit_nm, torque_limit_nm
 from iwm_power_manager.model.parameters import Axle, VehicleParams
@@ -105,7 +105,7 @@ def what_if(
     Raises
     ------
     BagError
-        The bag gives no step, or the car does not move.
+        The bag gives no step, or the car does not move (then `NoAnswerError`).
     """
     vehicle = plans[0][1].vehicle.params
     forces_n: dict[tuple[int, int], float] = {}  # by stamp, and how often it came: a clock may be set back
@@ -133,7 +133,9 @@ def what_if(
             raise BagError(f"{bag.path}: gave no control step: {replay.why_no_step()}")
         rows += [row] if recorded is None else [recorded, row]
     if rows[0].distance_m < _LEAST_DISTANCE_M or rows[0].chemical_wh == 0.0:
-        raise BagError(f"{bag.path}: the car does not move ({rows[0].distance_m:.2f} m): there is nothing to compare")
+        raise NoAnswerError(
+            f"{bag.path}: the car does not move ({rows[0].distance_m:.2f} m): there is nothing to compare"
+        )
     return rows, report
 
 

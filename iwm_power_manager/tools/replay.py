@@ -2,7 +2,7 @@
 """Command `replay`: the control law over a recorded drive, compared, published, or asked "what if".
 
 Exit codes: 0 done; 1 recomputed and recorded commands differ beyond the tolerance; 2 bad arguments or files;
-130 interrupted.
+3 there is no answer in the bag; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ examples:
     replay drive_01 --publish --rate 0.5
 
 exit codes: 0 done, 1 recomputed and recorded differ (--compare), 2 bad arguments or files, 3 they differ, but the
-recording lacks steps (it began in the middle of a run) whose memory may explain all of it, 130 interrupted
+recording lacks steps (it began in the middle of a run) whose memory may explain all of it, or the car does not move
+(--what-if), 130 interrupted
 """
 
 

@@ -17,7 +17,7 @@ from bags_helpers import joint_state_writer
 from foreign_bags import CHANNELS, COUNT, DEMAND, JOINTS, LINE, SPEED, drive, write_bag, write_mcap, write_sqlite
 from iwm_power_manager.bags.reader import BagReader
 from iwm_power_manager.errors import BagError
-from iwm_power_manager.exit_codes import BAD_INPUT, DONE
+from iwm_power_manager.exit_codes import BAD_INPUT, CANNOT_TELL, DONE
 from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.recorded import read_drives, read_signal
 from iwm_power_manager.replay.run import Replay
@@ -526,7 +526,7 @@ def test_a_car_that_stands_gives_no_zero_for_an_answer(
     entries = [(t, n, foreign.speed(t, 0.0) if n == 0 else data) for t, n, data in entries]
     bag = write_bag(tmp_path / "bag", [(t, n, b"\0\1\0\0" + bytes(8) if n == 1 else data) for t, n, data in entries])
     arguments = [str(bag), "--mapping", str(mapping), "--what-if", "jalalmaab_2015", "--strategy", "equal"]
-    assert main(arguments) == BAD_INPUT
+    assert main(arguments) == CANNOT_TELL
     assert "the car does not move" in capsys.readouterr().err
 
 

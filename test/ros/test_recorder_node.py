@@ -29,7 +29,7 @@ from std_srvs.srv import Trigger
 from disk_helpers import on_small_disk
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.bags.recover import recover
-from iwm_power_manager.exit_codes import BAD_INPUT
+from iwm_power_manager.exit_codes import BAD_INPUT, CANNOT_TELL
 
 PATIENCE_S = 60.0
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -492,6 +492,18 @@ def test_the_recover_command_needs_no_ros_and_says_what_was_lost(tmp_path: Path)
     done = subprocess.run([*command, str(tmp_path / "none")], capture_output=True, text=True, check=False)
     assert done.returncode == BAD_INPUT
     assert done.stderr == f"recorder: {tmp_path / 'none'}: does not exist\n"
+
+
+@pytest.mark.parametrize("length", [0, 4, 8, 60], ids=["empty", "within the magic", "the magic", "the header"])
+def test_a_recording_that_holds_nothing_has_no_answer_however_little_is_left(tmp_path: Path, length: int) -> None:
+    from iwm_power_manager.bags.writer import BagWriter
+    from iwm_power_manager.nodes.recorder import main
+
+    with BagWriter(tmp_path / "bag"):
+        pass
+    file = tmp_path / "bag" / "bag_0.mcap"
+    file.write_bytes(file.read_bytes()[:length])
+    assert [main(["--recover", str(tmp_path / "bag")]) for _ in range(2)] == [CANNOT_TELL] * 2
 
 
 def kill_while_publishing(path: Path, recorder: Callable[..., RecorderProcess], delay_s: float) -> float:
