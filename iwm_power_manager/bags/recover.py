@@ -155,7 +155,7 @@ def recover(path: Path | str) -> Recovery:
             kind = NoAnswerError if all(map(_just_begun, names)) else BagError
             raise kind(f"{left_out[0].damage}; nothing to recover")
         information, problem = read_metadata(path) if folder else ({}, "none")
-        fits = not (problem or left_out) and reader.listed_files(information).keys() == {name.name for name in names}
+        fits = not problem and reader.listed_files(information).keys() == {file.path.name for file in files}
         fits = fits and not miscounted(information, topic_counts(file.seen for file in files))
         sqlite = all(file.is_sqlite and not file.problem for file in files)
         for file in files:

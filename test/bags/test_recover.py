@@ -198,6 +198,21 @@ def test_of_a_split_bag_only_the_last_file_is_rebuilt(make_bag: Callable[..., Pa
     assert publish_times(path) == list(range(35))
 
 
+def test_a_file_that_holds_nothing_leaves_the_second_recovery_nothing_to_do(make_bag: Callable[..., Path]) -> None:
+    path = make_bag([("/a", i * 100, float(i)) for i in range(35)], max_duration_ns=1000)
+    (path / "bag_3.mcap").write_bytes(b"")
+    assert recover(path).metadata_written
+    report = recover(path)
+    assert not report.metadata_written
+    assert report.lines()[1:] == [
+        "  bag_0.mcap: whole, 10 messages",
+        "  bag_1.mcap: whole, 10 messages",
+        "  bag_2.mcap: whole, 10 messages",
+        f"  bag_3.mcap: left out: {path / 'bag_3.mcap'}: is empty",
+        "  nothing to recover",
+    ]
+
+
 def test_a_file_of_another_writer_with_channels_inside_of_chunks_is_recovered(tmp_path: Path) -> None:
     from mcap.writer import Writer
 
