@@ -38,7 +38,10 @@ from iwm_power_manager.bags.sqlite_source import SqliteSource
 from iwm_power_manager.errors import BagError, did_you_mean, system_errors
 
 SUFFIXES = (".mcap", ".db3")
-COMPRESSED_SUFFIXES = (".zstd", ".lz4")
+COMPRESSED_SUFFIXES = (".zstd", ".zst", ".lz4")
+#: What has to be unpacked by who packed it: how it begins, and what its name ends with.
+_FOREIGN = {b"\x1f\x8b": "gzip", b"BZh": "bzip2"}
+_FOREIGN_SUFFIXES = (".gz", ".bz2")
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _NEVER = 2**64
 _DIGITS = re.compile(r"\d+")
@@ -69,7 +72,7 @@ class BagReader(ExitStack):
 
     Parameters
     ----------
-    path : folder of the bag, or one `.mcap` or `.db3` file, which may be compressed (`.mcap.zstd`, `.mcap.lz4`)
+    path : folder of the bag, or one `.mcap` or `.db3` file, which may be compressed (`.mcap.zst`, `.mcap.lz4`)
 
     Attributes
     ----------
@@ -259,10 +262,10 @@ def plain_name(path: Path) -> str:
 
 
 def begins_as_data(path: Path, folder: Path | None = None) -> bool:
-    """Whether a file begins as one that can be read, whatever its name: not if it is what a power cut has left."""
+    """Whether a file begins as one that can be read (unpacked), whatever its name: not as what a power cut has left."""
     with suppress(BagError):
         regular_file(path, folder)
-        begins = (MAGIC, _SQLITE_MAGIC[: len(MAGIC)], *PACKED)
+        begins = (MAGIC, _SQLITE_MAGIC[: len(MAGIC)], *PACKED, *_FOREIGN)
         return path.suffix in COMPRESSED_SUFFIXES or _head(path, len(MAGIC)).startswith(begins)
     return False
 
@@ -285,10 +288,12 @@ def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside
     Raises
     ------
     BagError
-        It is no regular file, lies outside of its `folder`, or cannot be decompressed.
+        It is no regular file, lies outside of its `folder`, cannot be decompressed, or is packed by another program.
     """
     regular_file(path, folder)
     named = path.suffix in COMPRESSED_SUFFIXES
+    if packer := next((name for begin, name in _FOREIGN.items() if _head(path, len(begin)) == begin), ""):
+        raise BagError(f"{path}: is packed by {packer}: unpack it first")
     if journals(path):
         return path, "has a journal, which is not read: recorder --recover does that"
     if not named and _head(path, 4) not in PACKED:
@@ -326,7 +331,8 @@ def data_files(folder: Path) -> list[Path]:
     """Data files of a bag's folder in the order of recording: `bag_10.mcap` comes after `bag_9.mcap`."""
     with system_errors(folder, "cannot be read"):
         entries = list(folder.iterdir())
-    names = [entry for entry in entries if plain_name(entry).endswith(SUFFIXES)]
+    packed = [entry for entry in entries if entry.suffix in _FOREIGN_SUFFIXES and entry.stem.endswith(SUFFIXES)]
+    names = [entry for entry in entries if plain_name(entry).endswith(SUFFIXES)] or packed  # which say what to do
     real = {os.path.realpath(name) for name in names if not name.is_symlink()}
     names = [name for name in names if not (name.is_symlink() and os.path.realpath(name) in real)]  # the same twice
     return sorted(names, key=_recording_order)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import sqlite3
 from collections import Counter
 from collections.abc import Callable
@@ -135,17 +137,18 @@ def test_a_torn_file_of_compressed_messages_keeps_them_and_they_can_be_decoded(t
 
 @pytest.mark.parametrize("single", [True, False], ids=["file", "folder"])
 @pytest.mark.parametrize("whole", [True, False], ids=["whole", "torn"])
-def test_a_compressed_file_becomes_one_beside_it(tmp_path: Path, single: bool, whole: bool) -> None:
+@pytest.mark.parametrize("suffix", [".zstd", ".zst"])
+def test_a_compressed_file_becomes_one_beside_it(tmp_path: Path, single: bool, whole: bool, suffix: str) -> None:
     folder = tmp_path / "bag"
     # More than one block of zstd, so that half of it is something.
     path = foreign.write_mcap(folder / "a_0.mcap", foreign.drive(2000), chunk_bytes=2000, compression="none")
-    packed = folder / "a_0.mcap.zstd"
+    packed = folder / f"a_0.mcap{suffix}"
     content = zstandard.compress(path.read_bytes())
     packed.write_bytes(content if whole else content[: len(content) // 2])
     path.unlink()
-    before, original = messages(packed), packed.read_bytes()
+    before, original = messages(packed if single else folder), packed.read_bytes()
     report = recover(packed if single else folder)
-    assert report.files[0].kept == "a_0.mcap.zstd"
+    assert report.files[0].kept == packed.name
     assert packed.read_bytes() == original
     assert messages(path) == before
     assert len(before) > 50
@@ -154,6 +157,24 @@ def test_a_compressed_file_becomes_one_beside_it(tmp_path: Path, single: bool, w
         assert recover(folder).lines()[-1] == "  nothing to recover"
         with BagReader(folder) as reader:  # the original beside it is no damage
             assert reader.damage == []
+
+
+@pytest.mark.parametrize("packer", [gzip, bz2])
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_file_that_another_program_packed_says_what_to_do(tmp_path: Path, packer: Any, listed: bool) -> None:
+    folder = tmp_path / "bag"
+    path = foreign.write_mcap(folder / "a_0.mcap", foreign.drive())
+    packed = folder / f"a_0.mcap.{'gz' if packer is gzip else 'bz2'}"
+    packed.write_bytes(packer.compress(path.read_bytes()))
+    path.unlink()
+    if listed:
+        foreign.write_metadata(folder, relative_file_paths=[packed.name])
+    for bag in (folder, packed):
+        line = f"{packed}: is packed by {'gzip' if packer is gzip else 'bzip2'}: unpack it first"
+        with pytest.raises(BagError, match=line):
+            BagReader(bag)
+        with pytest.raises(BagError, match=line):
+            recover(bag)
 
 
 @pytest.mark.parametrize("single", [True, False], ids=["file", "folder"])
