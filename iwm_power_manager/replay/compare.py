@@ -76,6 +76,7 @@ class ReplayReport:
     first_stamp_ns, last_stamp_ns : of the steps
     span_ns : driven: from each step to the next, jumps back left out
     gaps : times at which steps are missing in the record, so that the law's memory is unknown
+    several : numbers of steps go back and forth, as of two nodes that published one state
     changed : steps whose torques are not the recorded ones, whatever the law remembers at a gap
     restarts : pauses in the inputs after which the law started anew
     bad_messages : messages that could not be decoded
@@ -94,6 +95,7 @@ class ReplayReport:
     last_stamp_ns: int = 0
     span_ns: int = 0
     gaps: int = 0
+    several: bool = False
     changed: int = 0
     restarts: int = 0
     bad_messages: int = 0

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iwm_power_manager.bags.losses import Losses
 from iwm_power_manager.bags.reader import BagReader, Message
 from iwm_power_manager.control import lockstep, monitor, record
 from iwm_power_manager.control.controller import Controller, ControllerLimits
@@ -134,6 +135,7 @@ class RecordedSteps:
         self._settings = plan.settings
         self._blocks: list[_Block] = []
         self._next = 0
+        self._numbers = Losses()
         self._stamp_ns = -1
         self._made: ReplayedStep | None = None
         self._alike_s = 0.0  # for how long all memories have given the same
@@ -205,6 +207,8 @@ class RecordedSteps:
         if 0.0 < numbers[_LOST] < 1 << len(WHEEL_NAMES):
             self._lost[int(numbers[_LOST])] += 1
         self._report.gaps += bool(begins)
+        self._numbers.take(number + 1)
+        self._report.several = self._numbers.several
         self._next, self._stamp_ns = number + 1, stamp_ns
 
     def _repeated(self, block: _Block) -> Iterator[ReplayedStep | None]:

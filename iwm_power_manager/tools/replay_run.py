@@ -81,19 +81,26 @@ def _replay(bag: BagReader, options: argparse.Namespace) -> int:
         if result["other_policy"]:
             lines.append("  the policy is not the one that was recorded: its file or folder has another SHA-256")
         lines += _comparison_lines(report)
-    code = DONE
-    if options.compare and not any(topic.compared for topic in report.comparison):
-        code = CANNOT_TELL
-    elif options.compare and exceeds(report.comparison, options.tolerance):
-        code = CANNOT_TELL if report.gaps and not report.changed else FAILED
-        if code == CANNOT_TELL:
-            lines.append(
-                "  cannot tell: the recording lacks steps whose memory may explain it; start the recorder first"
-            )
-        elif report.gaps:
-            lines.append(f"  {report.changed} step(s) differ whatever the law remembered of those the recording lacks")
+    code, verdict = _verdict(report, options.tolerance) if options.compare else (DONE, [])
+    lines += verdict
     _show(lines, result, options)
     return code
+
+
+def _verdict(report: ReplayReport, tolerance: float) -> tuple[int, list[str]]:
+    """Exit code of a comparison, and a line that explains it."""
+    if not any(topic.compared for topic in report.comparison):
+        return CANNOT_TELL, []
+    if not exceeds(report.comparison, tolerance):
+        return DONE, []
+    if report.several:
+        why = "two nodes seem to have published the state: its steps' numbers go back and forth"
+        return CANNOT_TELL, [f"  cannot tell: {why}"]
+    if report.gaps and not report.changed:
+        why = "the recording lacks steps whose memory may explain it; start the recorder first"
+        return CANNOT_TELL, [f"  cannot tell: {why}"]
+    found = f"  {report.changed} step(s) differ whatever the law remembered of those the recording lacks"
+    return FAILED, [found] if report.gaps else []
 
 
 def _what_if(bag: BagReader, options: argparse.Namespace) -> int:

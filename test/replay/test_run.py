@@ -390,6 +390,25 @@ def test_a_recording_that_begins_in_the_middle_of_a_run_is_no_verdict(
     assert last == "  cannot tell: the recording lacks steps whose memory may explain it; start the recorder first"
 
 
+def test_steps_of_two_nodes_on_one_topic_are_said_and_no_verdict(
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    state = "/power_manager/state"
+    with BagReader(drive) as source, BagWriter(tmp_path / "two") as bag:
+        numbers = {name: bag.add_topic(topic) for name, topic in source.topics.items()}
+        steps = []
+        for message in source.messages():
+            bag.write(numbers[message.topic], message.log_time_ns, message.data)
+            if message.topic == state:
+                steps.append(message.data)
+                if len(steps) > 40:  # the other node was started later
+                    bag.write(numbers[state], message.log_time_ns, steps[-41])
+    assert main([str(tmp_path / "two"), "--compare"]) == CANNOT_TELL
+    assert (
+        capsys.readouterr().out.splitlines()[-1].startswith("  cannot tell: two nodes seem to have published the state")
+    )
+
+
 class CalmDrive(ScriptedDrive):
     """Sensors that agree, and a demand that jumps now and then: nothing to remember from before the first jump."""
 
