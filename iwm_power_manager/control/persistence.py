@@ -10,6 +10,9 @@ new value that lasts. The strategy then judges a share by the mean over the late
 instead of by the present one. It averages costs, not demands: the cost of a jittering demand is not that of its mean;
 but for the part of its slip that wheels do not reach while it lasts (`model.decision.slip_followed`).
 
+A brake pedal asks for a force. In a stop the power of one that rests falls with the speed, to nothing: powers of a
+second ago, taken for powers of now, would be forces that nobody asks for. So braking is remembered as a force.
+
 The noise goes on. The cost-to-go of a policy that knows none would answer the next jump with a change; what really
 happens is that the share is held and meets the same jumps again. So the mean cost of a step counts for as long as the
 estimate is good: until the signal, which wanders q = s2 K^2 / (1 - K) a sample, is on average over that time as
@@ -48,6 +51,7 @@ class Jitter(NamedTuple):
     ----------
     age_s : time since the latest sample
     samples_w : demand at the latest samples, newest first
+    speeds_mps : speed of the car at these
     taken : samples taken in all
     step_w : latest difference of two
     variance_w2, covariance_w2 : means of d_t^2 and d_t d_(t-1)
@@ -56,6 +60,7 @@ class Jitter(NamedTuple):
 
     age_s: float
     samples_w: Samples
+    speeds_mps: Samples
     taken: int
     step_w: float
     variance_w2: float
@@ -68,6 +73,7 @@ def no_jitter() -> Jitter:
     return Jitter(
         age_s=0.0,
         samples_w=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        speeds_mps=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         taken=0,
         step_w=0.0,
         variance_w2=0.0,
@@ -92,29 +98,43 @@ def held_s(gain: float) -> float:
 
 
 @kernel
-def observed(jitter: Jitter, demand_w: float, seconds: float) -> Jitter:
-    """Take note of the demand, `seconds` after the last time."""
+def observed(jitter: Jitter, demand_w: float, speed_mps: float, seconds: float) -> Jitter:
+    """Take note of the demand, and of the speed it was made at, `seconds` after the last time."""
     age = jitter.age_s + seconds
     if jitter.taken > 0 and age < SAMPLE_S - 1e-6:
         return Jitter(
             age,
             jitter.samples_w,
+            jitter.speeds_mps,
             jitter.taken,
             jitter.step_w,
             jitter.variance_w2,
             jitter.covariance_w2,
             jitter.gain,
         )
-    s = jitter.samples_w
+    s, v = jitter.samples_w, jitter.speeds_mps
     samples = (demand_w, s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8])
+    speeds = (speed_mps, v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8])
     if jitter.taken == 0:
-        return Jitter(0.0, samples, 1, 0.0, 0.0, 0.0, 1.0)
+        return Jitter(0.0, samples, speeds, 1, 0.0, 0.0, 0.0, 1.0)
     step = demand_w - s[0]
     weight = max(SAMPLE_S / MOMENTS_S, 1.0 / jitter.taken)
     variance = jitter.variance_w2 + weight * (step * step - jitter.variance_w2)
     covariance = jitter.covariance_w2 + weight * (step * jitter.step_w - jitter.covariance_w2)
     gain = lasting_gain(variance, covariance)
-    return Jitter(0.0, samples, jitter.taken + 1, step, variance, covariance, gain)
+    return Jitter(0.0, samples, speeds, jitter.taken + 1, step, variance, covariance, gain)
+
+
+@kernel
+def carried_w(jitter: Jitter, k: int, speed_mps: float, floor_mps: float) -> float:
+    """The demand of the k-th sample at a speed, W: driving the same power, braking the same force.
+
+    `floor_mps` : below it a power cannot be turned into a force (`model.pedals`)
+    """
+    demand_w = jitter.samples_w[k]
+    if demand_w >= 0.0:
+        return demand_w
+    return demand_w * max(speed_mps, floor_mps) / max(jitter.speeds_mps[k], floor_mps)
 
 
 @kernel

@@ -73,7 +73,7 @@ def split(
     age = memory.age_s + measurement.dt_s
     decided = memory.decided_share
     used = leaked(memory.changes_used, measurement.dt_s, policy.changes_per_min)
-    jitter = observed(memory.jitter, measurement.power_demand_w, measurement.dt_s)
+    jitter = observed(memory.jitter, measurement.power_demand_w, speed_mps, measurement.dt_s)
     # Half a step of slack: sums of 0.01 s must not delay every tenth decision by a step.
     if first or age >= settings.decision_period_s - 0.5 * measurement.dt_s:
         situation = Situation(

@@ -10,6 +10,7 @@ import pytest
 
 from iwm_power_manager.control.persistence import (
     Jitter,
+    carried_w,
     demand_ago,
     held_s,
     lasting_gain,
@@ -19,10 +20,10 @@ from iwm_power_manager.control.persistence import (
 )
 
 
-def watched(demand_w: np.ndarray, step_s: float = 0.01) -> Jitter:
+def watched(demand_w: np.ndarray, step_s: float = 0.01, speed_mps: np.ndarray | float = 10.0) -> Jitter:
     jitter = no_jitter()
-    for power in demand_w:
-        jitter = observed(jitter, float(power), step_s)
+    for power, speed in zip(demand_w, np.broadcast_to(speed_mps, len(demand_w)), strict=True):
+        jitter = observed(jitter, float(power), float(speed), step_s)
     return jitter
 
 
@@ -45,7 +46,7 @@ def test_a_demand_that_wanders_or_ramps_is_taken_as_it_is():
     rng = np.random.default_rng(1)
     jitter, taken_as_it_is = no_jitter(), 0
     for power in np.cumsum(300.0 * rng.standard_normal(3000)):
-        jitter = observed(jitter, float(power), 0.1)
+        jitter = observed(jitter, float(power), 10.0, 0.1)
         taken_as_it_is += jitter.gain == 1.0
     assert taken_as_it_is > 0.85 * 3000  # two standard errors: by chance, a little of it looks like noise
     assert watched(np.linspace(0.0, 9000.0, 3000)).gain == 1.0
@@ -66,6 +67,16 @@ def test_the_latest_second_is_remembered_newest_first():
     assert found.age_s == pytest.approx(0.09)
 
 
+def test_the_brake_of_a_second_ago_is_the_same_force_now_and_the_accelerator_the_same_power():
+    speed = np.linspace(8.0, 0.0, 160)  # to rest at 5 m/s2, with a foot that rests on the brake
+    found = watched(-1500.0 * np.maximum(speed, 1.0), speed_mps=speed)
+    for now in (6.0, 1.0, 0.2):
+        carried = [carried_w(found, k, now, 1.0) for k in range(10)]
+        assert carried == pytest.approx([-1500.0 * max(now, 1.0)] * 10)
+    found = watched(1500.0 * speed, speed_mps=speed)
+    assert tuple(carried_w(found, k, 6.0, 1.0) for k in range(10)) == found.samples_w
+
+
 def test_the_demand_some_time_ago_is_that_between_two_samples_and_the_present_one_where_none_is_that_old():
     found = watched(np.arange(3000.0))  # 1 W each 0.01 s; the latest sample is 0.09 s old
     assert [demand_ago(found, 2999.0, seconds) for seconds in (0.09, 0.2, 0.95)] == pytest.approx([2990, 2979, 2904])
@@ -84,4 +95,4 @@ def test_without_noise_nothing_is_held_and_with_noise_until_the_signal_is_as_unc
 
 def test_nothing_is_known_before_the_first_demand():
     assert no_jitter().gain == 1.0 and no_jitter().taken == 0
-    assert observed(no_jitter(), 5.0, 0.01).samples_w[0] == 5.0
+    assert observed(no_jitter(), 5.0, 10.0, 0.01).samples_w[0] == 5.0

@@ -244,16 +244,24 @@ def test_of_now_and_a_step_of_the_chain_ago_the_mean_counts_and_what_both_ask_fo
 @given(
     st.lists(POWER, min_size=4, max_size=4),
     st.floats(2.0, 35.0),
+    st.lists(st.floats(0.5, 2.0), min_size=3, max_size=3),
     SHARE,
     st.sampled_from([0.2, 0.5, 0.9]),
     st.sampled_from([0.0, 0.6]),
 )
 def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_noise_lasts(
-    demands, speed, previous, friction, discount
+    demands, speed, faster_by, previous, friction, discount
 ):
     gain = 0.5
     demand, *latest = demands
-    jitter = no_jitter()._replace(samples_w=(*latest, *(0.0,) * 7), taken=3, gain=gain)
+    jitter = no_jitter()._replace(
+        samples_w=(*latest, *(0.0,) * 7),
+        speeds_mps=(*(by * speed for by in faster_by), *(0.0,) * 7),
+        taken=3,
+        gain=gain,
+    )
+    # Braking, the same force as then.
+    demands = [demand, *(w if w > 0.0 else w / by for w, by in zip(latest, faster_by, strict=True))]
     at = situation(demand, speed, previous=previous)._replace(jitter=jitter)
     table = TABLE._replace(problem=TABLE.problem._replace(friction=friction), discount=discount)
     ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, table)

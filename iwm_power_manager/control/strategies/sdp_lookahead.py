@@ -12,7 +12,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from iwm_power_manager.control.budget import affordable, price_factor, price_level, price_units
-from iwm_power_manager.control.persistence import SAMPLE_S, SAMPLES, demand_ago, held_s, remembered_s
+from iwm_power_manager.control.persistence import SAMPLE_S, SAMPLES, carried_w, demand_ago, held_s, remembered_s
 from iwm_power_manager.control.strategies.instantaneous import LEAST_DIFFERENCE_W
 from iwm_power_manager.control.strategy import Situation, Strategy
 from iwm_power_manager.control.table import PolicyTable
@@ -102,28 +102,34 @@ def _sample(power_demand_w: float, situation: Situation, vehicle: VehicleParams,
 
 
 @kernel
+def _before(k: int, situation: Situation, vehicle: VehicleParams) -> float:
+    """The k-th of the demands before, W, as it would be now."""
+    return carried_w(situation.jitter, k, situation.speed_mps, vehicle.driver.power_speed_floor_mps)
+
+
+@kernel
 def _jittering(situation: Situation, vehicle: VehicleParams, policy: PolicyTable) -> tuple[_Sample, ...]:
     """The present demand, all those before it that a jitter holds, and at the end the mean of those that count."""
-    demand_w, gain, before_w = situation.power_demand_w, situation.jitter.gain, situation.jitter.samples_w
+    demand_w, gain = situation.power_demand_w, situation.jitter.gain
     weights = weight = gain
     mean_w = weight * demand_w
     for i in range(min(SAMPLES, situation.jitter.taken)):
         weight *= 1.0 - gain
-        mean_w += weight * before_w[i]
+        mean_w += weight * _before(i, situation, vehicle)
         weights += weight
     # Written out, since kernels make no arrays and numba no tuples in a loop; as many as `SAMPLES`.
     return (
         _sample(demand_w, situation, vehicle, policy),
-        _sample(before_w[0], situation, vehicle, policy),
-        _sample(before_w[1], situation, vehicle, policy),
-        _sample(before_w[2], situation, vehicle, policy),
-        _sample(before_w[3], situation, vehicle, policy),
-        _sample(before_w[4], situation, vehicle, policy),
-        _sample(before_w[5], situation, vehicle, policy),
-        _sample(before_w[6], situation, vehicle, policy),
-        _sample(before_w[7], situation, vehicle, policy),
-        _sample(before_w[8], situation, vehicle, policy),
-        _sample(before_w[9], situation, vehicle, policy),
+        _sample(_before(0, situation, vehicle), situation, vehicle, policy),
+        _sample(_before(1, situation, vehicle), situation, vehicle, policy),
+        _sample(_before(2, situation, vehicle), situation, vehicle, policy),
+        _sample(_before(3, situation, vehicle), situation, vehicle, policy),
+        _sample(_before(4, situation, vehicle), situation, vehicle, policy),
+        _sample(_before(5, situation, vehicle), situation, vehicle, policy),
+        _sample(_before(6, situation, vehicle), situation, vehicle, policy),
+        _sample(_before(7, situation, vehicle), situation, vehicle, policy),
+        _sample(_before(8, situation, vehicle), situation, vehicle, policy),
+        _sample(_before(9, situation, vehicle), situation, vehicle, policy),
         _sample(mean_w / weights, situation, vehicle, policy),
     )
 
