@@ -4,6 +4,7 @@
 What the road takes from a wheel is told by its torque, and by how its speed changed meanwhile. Wheel speeds come late,
 several at a time or not at all, so that the torque of the last step is not the one that belongs to them: the slip
 limiter would answer its own torque, and swing. Stamps say when speeds were measured; the torques of then are looked up.
+What neither stamps nor `delay_s` say is found (`found_delay`).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
+from iwm_power_manager.control.found_delay import FoundDelay
 from iwm_power_manager.control.types import Command, Measurement, Wheels
 
 _NS_PER_S = 1e9
@@ -22,6 +24,8 @@ _LEAST_PART = 0.5
 _SILENT_NS = 60_000_000
 #: Weights of a speed that is made of the newest message alone.
 ALONE = (1.0,)
+#: Delays are told from each other for so long after a torque has changed by so much in a step, N m.
+_LIVELY_NS, _LIVELY_NM = 100_000_000, 50.0
 NO_SHIFT: Wheels = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -42,6 +46,10 @@ class Alignment:
     ----------
     inertia_kgm2 : of each wheel
     delay_s : time after which a command is a torque
+
+    Attributes
+    ----------
+    found : by how much torques act later than stamps and `delay_s` say
     """
 
     def __init__(self, inertia_kgm2: Sequence[float], delay_s: float) -> None:
@@ -57,10 +65,14 @@ class Alignment:
         self._road_nm: Wheels | None = None
         self._means: deque[Wheels] = deque()
         self._newest_ns = self._arrived_ns = 0
+        self._lively_ns = -_LIVELY_NS
+        self.found = FoundDelay()
 
     def applied(self, now_ns: int, torque_nm: Wheels) -> None:
         """Note the torques that are commanded now."""
         torques = self._torques
+        if torques and max(abs(a - b) for a, b in zip(torque_nm, torques[-1][1], strict=True)) > _LIVELY_NM:
+            self._lively_ns = now_ns
         torques.append((now_ns, torque_nm))
         # Of speeds that are as old as may be, since those before, which may be as much older.
         while len(torques) > 1 and torques[1][0] < now_ns - self._delay_ns - 2.0 * LATEST_S * _NS_PER_S:
@@ -96,15 +108,25 @@ class Alignment:
             # After a gap in the messages nobody knows what the road took in it.
             self._since_ns, self._since_radps = stamp_ns, speed_radps
         elif since_s >= _LEAST_PART * dt_s:
-            mean = self._weighted_nm(self._since_ns - self._delay_ns, stamp_ns - self._delay_ns, weights)
             start = self._since_radps
-            a, b, c, d = [mean[i] - inertia[i] * (speed_radps[i] - start[i]) / since_s for i in range(4)]
-            self._road_nm = road = a, b, c, d
+            a, b, c, d = [inertia[i] * (speed_radps[i] - start[i]) / since_s for i in range(4)]
+            if len(weights) == 1:
+                self._learn(stamp_ns, (a, b, c, d), speed_radps)
+            delay_ns = self._delay_ns + self.found.beyond_ns
+            mean = self._weighted_nm(self._since_ns - delay_ns, stamp_ns - delay_ns, weights)
+            self._road_nm = road = mean[0] - a, mean[1] - b, mean[2] - c, mean[3] - d
             self._since_ns, self._since_radps = stamp_ns, speed_radps
         if road is None or now_ns - self._arrived_ns > _SILENT_NS:
             return NO_SHIFT
         a, b, c, d = [road[i] + inertia[i] * (speed_radps[i] - before[i]) / dt_s - last[i] for i in range(4)]
         return a, b, c, d
+
+    def _learn(self, stamp_ns: int, turned_nm: Wheels, speed_radps: Wheels) -> None:
+        if stamp_ns - self._lively_ns > _LIVELY_NS:
+            self.found.rest(self._torques[-1][1], turned_nm)
+            return
+        from_ns, to_ns = self._since_ns - self._delay_ns, stamp_ns - self._delay_ns
+        self.found.learn(self._torques, from_ns, to_ns, turned_nm, speed_radps)
 
     def _weighted_nm(self, from_ns: int, to_ns: int, weights: Sequence[float]) -> Wheels:
         """Mean of the torques by which a speed has changed that is made of several messages."""

@@ -97,7 +97,7 @@ class Thresholds:
     motor_lag_s: float = _threshold(
         0.06, "s", 0.0, 1.0, "a reported motor torque may belong to any command of this time"
     )
-    # Nobody knows it of motors, brakes and stamps: too long by 3 ms it lets torques swing, too short by 5 it does not.
+    # Where it begins: what it is off by is found as soon as torques change a lot (`found_delay`).
     actuator_delay_s: float = _threshold(
         0.002, "s", 0.0, 0.2, "time after which a command is a torque at the wheel, of motors and brakes"
     )

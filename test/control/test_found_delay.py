@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much later torques act than is told: against wheels that turn as torque, road and the true delay say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iwm_power_manager.control.alignment import Alignment
+from iwm_power_manager.control.coarse import line_weights
+
+MS = 1_000_000
+INERTIA = (0.8, 0.8, 1.3, 1.3)
+PERIOD_MS = 10
+STEPS = 40
+
+
+class Wheels:
+    """Wheels that a controller turns with torques that jump about, seen every 10 ms.
+
+    Parameters
+    ----------
+    torques : commands of each step; every wheel has its own part of them
+    delay_ms : after a command until it acts; below 0, stamps look older than they are
+    stiff : part of a change of torque that the road takes at once
+    """
+
+    def __init__(self, torques, delay_ms, *, stiff=0.0, start=900.0, noise=0.0, every_ms=PERIOD_MS):
+        self.torques = [(t, 0.9 * t, 1.1 * t, t) for t in torques]
+        random = np.random.default_rng(1)
+        speed, self.shown = [start] * 4, []
+        for ms in range(PERIOD_MS * len(torques) + 100):
+            if ms % every_ms == 0:
+                self.shown.append(tuple(w + noise * float(random.standard_normal()) for w in speed))
+            k = (ms - delay_ms) // PERIOD_MS
+            acting = self.torques[min(max(k, 0), len(torques) - 1)]
+            speed = [w + 1e-3 * (1.0 - stiff) * (t + 150.0) / i for w, t, i in zip(speed, acting, INERTIA, strict=True)]
+
+    def found_ms(self, told_ms=0, change=lambda k, shown: shown, weights=(1.0,)):
+        """What is found in each step; `change` is what sensors make of the speeds."""
+        alignment, found = Alignment(INERTIA, told_ms / 1e3), []
+        for k, torque in enumerate(self.torques):
+            now = k * PERIOD_MS * MS
+            alignment.shift_nm(now, PERIOD_MS / 1e3, now, change(k, self.shown[k]), weights)
+            alignment.applied(now, torque)
+            found.append(alignment.found.beyond_ns / MS)
+        return found
+
+
+def jumping(seed=0, least=150.0):
+    """Torques that jump by at least so much, up and down by chance, about what the road takes."""
+    random = np.random.default_rng(seed)
+    return [-150.0 + float(random.choice((-1.0, 1.0)) * random.uniform(0.5, 1.5) * least) for _ in range(STEPS)]
+
+
+@given(st.integers(0, 99), st.integers(0, 30), st.sampled_from((0, 2, 5, 10)))
+def test_a_delay_that_nobody_tells_is_found_and_not_taken_for_much_longer(seed, true_ms, told_ms):
+    """Too short by 8 ms is borne, too long by 3 is not."""
+    found = Wheels(jumping(seed), true_ms).found_ms(told_ms)[-1] + told_ms
+    assert -8 < found - true_ms < 2 or (found == told_ms - 20 and true_ms < found)
+
+
+@given(st.integers(0, 99), st.sampled_from((5, 10, 15, 20, 25, 30)))
+def test_it_is_found_within_few_steps_through_the_noise_of_wheel_speeds(seed, true_ms):
+    found = Wheels(jumping(seed, 300.0), true_ms, noise=0.1).found_ms()
+    assert all(abs(ms - true_ms) <= 5 for ms in found[15:])
+
+
+@given(st.integers(0, 99))
+def test_one_that_is_told_too_long_is_found_to_be_shorter(seed):
+    assert Wheels(jumping(seed), 2).found_ms(told_ms=12)[-1] == -10
+
+
+@given(st.integers(0, 99), st.floats(0.0, 0.2), st.integers(0, 20))
+def test_what_is_told_right_stays(seed, noise, true_ms):
+    assert not any(Wheels(jumping(seed), true_ms, noise=noise).found_ms(told_ms=true_ms))
+
+
+def test_torques_that_hardly_change_tell_nothing():
+    """What noise of 0.1 rad/s makes of them either: the command answers it, and seems to come before it."""
+    torques = [-150.0 + 30.0 * (-1) ** (k // 3) for k in range(STEPS)]
+    assert not any(Wheels(torques, 20, noise=0.1).found_ms())
+    torques = [-150.0 + 44.0 * (-1) ** k for k in range(STEPS)]
+    assert not any(Wheels(torques, 15).found_ms())
+
+
+@pytest.mark.parametrize("start", [4.0, -4.0])
+def test_wheels_that_nearly_stand_tell_nothing(start):
+    still = Wheels(jumping(), 20, start=0.0)
+    slow = still.found_ms(change=lambda k, shown: tuple(start + 1e-3 * (w - start) for w in shown))
+    assert not any(slow)
+    assert Wheels(jumping(), 20, start=-900.0).found_ms()[-1] == 20
+
+
+def test_where_the_road_takes_all_that_a_torque_changes_no_delay_is_told():
+    """As on a good road, far from its limit: it is no delay by which torques have yet to act."""
+    for seed in range(20):
+        found = Wheels(jumping(seed, 300.0), 0, stiff=0.9, noise=0.05).found_ms()
+        assert not any(found)
+    one = [-150.0] * 5 + [-650.0] * 35
+    assert not any(Wheels(one, 0, stiff=0.8).found_ms())
+
+
+@pytest.mark.parametrize("wheel", range(4))
+def test_three_wheels_tell_it_beside_one_that_is_wrong(wheel):
+    random = np.random.default_rng(2)
+
+    def astray(k, shown):
+        return tuple(60.0 + 5.0 * float(random.standard_normal()) if i == wheel else w for i, w in enumerate(shown))
+
+    assert Wheels(jumping(), 15).found_ms(change=astray)[-1] == 15
+    assert not any(Wheels(jumping(), 0).found_ms(change=astray))
+
+
+def test_a_jump_of_all_wheels_is_no_delay():
+    def jumped(k, shown):
+        return tuple((0.75 if k >= 20 else 1.0) * w for w in shown)
+
+    for seed in range(20):
+        assert not any(Wheels(jumping(seed), 0).found_ms(change=jumped))
+
+
+def test_the_first_jump_after_a_long_rest_tells_it():
+    """A full stop begins like that."""
+    torques = [-10.0] * 30 + [-500.0, -900.0, -700.0, -100.0, -300.0, -250.0]
+    assert Wheels(torques, 10).found_ms()[30:] == [0, 0, 10, 10, 10, 10]
+
+
+def test_it_is_forgotten_with_the_rest():
+    wheels, alignment = Wheels(jumping(), 20), Alignment(INERTIA, 0.0)
+    for k, torque in enumerate(wheels.torques):
+        alignment.shift_nm(k * PERIOD_MS * MS, 0.01, k * PERIOD_MS * MS, wheels.shown[k])
+        alignment.applied(k * PERIOD_MS * MS, torque)
+    assert alignment.found.beyond_ns / MS == 20
+    alignment.forget()
+    assert alignment.found.beyond_ns / MS == 0
+
+
+def test_wheels_that_count_teeth_tell_no_delay():
+    """Their speeds are of several messages."""
+    assert not any(Wheels(jumping(), 20).found_ms(weights=line_weights(5)))
+
+
+def test_the_road_is_told_by_the_delay_that_was_found():
+    wheels, alignment = Wheels(jumping(), 15), Alignment(INERTIA, 0.0)
+    before = None
+    for k, torque in enumerate(wheels.torques):
+        shown, now = wheels.shown[k], k * PERIOD_MS * MS
+        shift = alignment.shift_nm(now, 0.01, now, shown)
+        if k > 30 and before is not None:
+            last = wheels.torques[k - 1]
+            road = [last[i] + shift[i] - INERTIA[i] * (shown[i] - before[i]) / 0.01 for i in range(4)]
+            assert road == pytest.approx([-150.0] * 4, abs=1e-6)
+        alignment.applied(now, torque)
+        before = shown
