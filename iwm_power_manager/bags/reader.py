@@ -335,6 +335,7 @@ def data_files(folder: Path) -> list[Path]:
     names = [entry for entry in entries if plain_name(entry).endswith(SUFFIXES)] or packed  # which say what to do
     real = {os.path.realpath(name) for name in names if not name.is_symlink()}
     names = [name for name in names if not (name.is_symlink() and os.path.realpath(name) in real)]  # the same twice
+    names = [name for name in names if name.suffix not in COMPRESSED_SUFFIXES or name.with_suffix("") not in names]
     return sorted(names, key=_recording_order)
 
 

@@ -12,6 +12,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
+import zstandard
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -158,6 +159,13 @@ def test_a_clock_that_was_set_back_within_what_is_read_at_once_is_seen_too(tmp_p
         assert [m.log_time_ns for m in reader.messages()] == [time_ns for time_ns, *_ in shifted]
         (note,) = reader.notes
     assert note.endswith("the clock was set back meanwhile: it is read in the order of recording")
+
+
+def test_a_file_beside_its_compressed_copy_is_read_once(tmp_path: Path) -> None:
+    content = foreign.write_mcap(tmp_path / "bag" / "a_0.mcap", foreign.drive()).read_bytes()
+    (tmp_path / "bag" / "a_0.mcap.zstd").write_bytes(zstandard.compress(content))
+    with BagReader(tmp_path / "bag") as reader:
+        assert len(list(reader.messages())) == len(foreign.drive())
 
 
 def test_files_of_two_recorders_are_merged_by_their_log_times(tmp_path: Path) -> None:
