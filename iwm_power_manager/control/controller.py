@@ -142,6 +142,11 @@ class Controller:
         return sum(1 << i for i, verdict in enumerate(self.monitor.verdicts) if verdict is not WheelVerdict.GOOD)
 
     @property
+    def torques_later_s(self) -> float:
+        """By how much torques were found to act later than stamps and `actuator_delay_s` say."""
+        return self._alignment.found.beyond_ns / 1e9
+
+    @property
     def believed_speed_mps(self) -> float:
         """Speed of the car: as its sensor shows it; as estimated while that is missing or not believed."""
         command = self.command

@@ -191,7 +191,8 @@ class PowerManagerReport:
                 self.doubts += [words for words in (self._cut, self._against, self._stuck) if words]
             statuses.append(sensors)
             friction_nm = controller.command.friction_torque_nm if controller.command else (0.0,) * 4
-            statuses.append(diagnostics.motors_status(controller.actuators, friction_nm, self._wheel_names))
+            later_s = controller.torques_later_s
+            statuses.append(diagnostics.motors_status(controller.actuators, friction_nm, self._wheel_names, later_s))
             statuses.append(diagnostics.brakes_status(controller.brake_gain, self._wheel_names))
             statuses.append(self._loop.report(self._rate_hz, values))
         self._activity.clear()

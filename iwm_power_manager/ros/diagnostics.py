@@ -21,6 +21,8 @@ from iwm_power_manager.control.types import GATE_NAMES, Wheels
 from iwm_power_manager.ros.messages import ns_to_stamp
 
 OK, WARN, ERROR, STALE = range(4)
+#: Torques that act by so much later, or sooner, than is told are warned of, s.
+_LATE_S = 0.005
 _LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE)
 
 
@@ -205,10 +207,21 @@ def control_status(
     return Status("control", ERROR if missing else WARN, f"{mode}{reason}", values)
 
 
-def motors_status(actuators: ActuatorState, friction_nm: Wheels, wheel_names: Sequence[str]) -> Status:
-    """Which motors do not do what they are told, what of their torque is counted on, and whose brakes hold them."""
-    values = {"reported torque": "judged" if actuators.reporting else "none that follows the commands"}
+def motors_status(
+    actuators: ActuatorState, friction_nm: Wheels, wheel_names: Sequence[str], later_s: float = 0.0
+) -> Status:
+    """Which motors do not do what they are told, what of their torque is counted on, and whose brakes hold them.
+
+    `later_s` : by how much torques were found to act later than stamps and `actuator_delay_s` say
+    """
+    values = {
+        "reported torque": "judged" if actuators.reporting else "none that follows the commands",
+        "torques act later than told (ms)": f"{1e3 * later_s:g}",
+    }
     problems: list[tuple[int, str]] = []
+    if abs(later_s) >= _LATE_S:
+        words = f"{1e3 * abs(later_s):g} ms {'later' if later_s > 0.0 else 'sooner'}"
+        problems.append((WARN, f"torques act {words} than stamps of wheel_states and actuator_delay_s say"))
     for name, motor, brake_nm in zip(wheel_names, actuators.motors, friction_nm, strict=True):
         values[f"motor {name}"] = _words(motor.verdict)
         values[f"motor {name}: counted on (%)"] = f"{100.0 * motor.gain:.0f}"

@@ -231,6 +231,16 @@ def test_a_motor_that_does_not_follow_is_named():
     assert (quiet.level, quiet.values["reported torque"]) == (OK, "none that follows the commands")
 
 
+@pytest.mark.parametrize(
+    ("later_s", "level", "words"),
+    [(0.0, OK, ""), (0.0025, OK, ""), (0.0125, WARN, "12.5 ms later"), (-0.01, WARN, "10 ms sooner")],
+)
+def test_torques_that_act_at_another_time_than_is_told_are_said(later_s, level, words):
+    status = motors_status(ActuatorState(), NONE_NM, ("fl", "fr", "rl", "rr"), later_s)
+    assert (status.level, words in status.message) == (level, True)
+    assert float(status.values["torques act later than told (ms)"]) == pytest.approx(1e3 * later_s)
+
+
 @pytest.mark.parametrize(("brake_nm", "more"), [(0.0, ""), (-60.0, " at 60 N m, held by its brake")])
 def test_a_brake_that_holds_a_stuck_motor_is_said(brake_nm, more):
     motors = (Evidence(), Evidence(), Evidence(), Evidence(MotorVerdict.STUCK, 0.0, 60.0))
@@ -318,6 +328,7 @@ def test_an_input_that_does_not_come_is_missing_and_not_doubted(stale, named):
         monitor=SimpleNamespace(tallies={}, verdicts=(WheelVerdict.GOOD,) * 4, agree=False, apart=""),
         actuators=ActuatorState(),
         brake_gain=(1.0,) * 4,
+        torques_later_s=0.0,
     )
     for _ in range(5):
         report.note_step(command, controller.supervision, 0.0, 0.01, 1e-4)
