@@ -15,7 +15,13 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 
 ROOT = Path(__file__).resolve().parents[1]
-_KEEP_TIME = ("test_faults.py", "test_processes.py", "test_watch_car.py")
+_KEEP_TIME = {
+    f"test_{name}.py"
+    for name in (
+        *("cluster", "domains", "executables", "faults", "fleet", "held", "power_cut", "processes", "recorded"),
+        *("recording", "recover", "run", "watch_car", "witness"),
+    )
+}
 
 # Continuous integration repeats the same examples: a change is judged by what it changes, not by luck.
 settings.register_profile("default", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
@@ -69,7 +75,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what starts several processes that keep time: on few cores they have to have these for themselves."""
+    """Mark what starts, signals or counts processes that keep time: these have the cores for themselves."""
     for item in items:
         parts = item.path.relative_to(ROOT).parts
         if "ros" in parts or parts[-1] in _KEEP_TIME:
