@@ -142,6 +142,15 @@ def test_what_arrives_without_a_delay_gives_the_same_bits_and_20_ms_later_others
     np.testing.assert_array_equal(series(delay_s=0.02, jitter_s=0.005), late)
 
 
+def test_the_power_manager_says_by_how_much_torques_act_later_than_told():
+    """Of 20 ms that no stamp shows `actuator_delay_s` explains 2; the plant's motors have none of their own."""
+    scenario = load_scenario("unstamped_stop_02")
+    manager = road_run.controller_of(scenario)
+    assert manager.torques_later_s == 0.0
+    road_run.drive_scenario(scenario, manager)
+    assert manager.torques_later_s == pytest.approx(0.018, abs=0.0051)
+
+
 @pytest.mark.parametrize("road", ["stop_02", "stop_09", "split_stop", "split_stop_imu"])
 def test_in_a_stop_at_the_limit_torques_do_not_swing(road):
     scenario = load_scenario(road)

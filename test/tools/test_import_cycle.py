@@ -227,6 +227,7 @@ def test_a_trace_the_car_cannot_follow_is_warned_of(tmp_path, capsys):
             "time_s,speed_mps\n" + "".join(f"{t},{min(5 * t, 90)}\n" for t in range(40)),
             "looks like km/h in the m/s column (--speed",
         ),
+        ("time_ms,speed m/s\n5000,0\n6000,3\n7000,60\n8000,60\n", "log.csv: 6 s: speed gains 57 m/s in a second"),
         ("a,b\n0,0\n1,1\n", "has no column that looks like time: name it with --time; allowed: a, b"),
         ("Zeit_s;w\n0;0\n1;1\n", "has no column that looks like speed: name it with --speed; allowed: Zeit_s, w"),
         ("time_s,speed m/s\n0,0\n1,fast\n", "line 3, speed m/s: 'fast' is no number"),
