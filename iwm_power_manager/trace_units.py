@@ -48,8 +48,8 @@ _NEAR = 0.05
 #: A demand explains the car's motion where so many seconds correlate so much; so many times more energy than was asked
 #: for is no other car's mass and no slope.
 _LEAST_SECONDS, _EXPLAINS, _TIMES_DEMAND = 10, 0.7, 5.0
-#: Powers that are taken for watts, by what they are of it.
-_POWERS = {1000.0: "kW", 735.5: "PS", 745.7: "hp"}
+#: So many times more it is where kilowatts were taken for watts, whatever the road load and the mass that was meant.
+_KILO = (300.0, 3000.0)
 
 
 class Steepest(NamedTuple):
@@ -198,8 +198,7 @@ class Energies:
         ratio = both / demand
         if ratio < _TIMES_DEMAND:
             return ""
-        meant = [unit for times, unit in _POWERS.items() if times / 2.0 < ratio < times]
-        words = f"is it in {' or '.join(meant)}" if meant else "another unit, or another car"
+        words = "is it in kW" if _KILO[0] < ratio < _KILO[1] else "another unit, or another car"
         return f"the car gains {ratio:.3g} times the energy that power_demand asks for: {words}?"
 
 

@@ -62,3 +62,10 @@ def test_two_publishers_of_one_topic_have_lost_nothing_by_the_numbers_in_a_bag(t
             bag.write(both, step, float64(0.0), step, 1 + step)
             bag.write(one, step, float64(0.0), step, 1 + step + (step > 9))
     assert recover(tmp_path / "bag").missing == {"/one": 1}
+
+
+def test_a_counter_that_passes_its_largest_after_it_went_back_is_another_s():
+    losses = Losses()
+    for number in (100, 1, 101):
+        losses.take(number)
+    assert losses.several

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control.alignment import Alignment
 from iwm_power_manager.control.coarse import line_weights
+from iwm_power_manager.control.found_delay import FoundDelay
 
 MS = 1_000_000
 INERTIA = (0.8, 0.8, 1.3, 1.3)
@@ -24,17 +25,19 @@ class Wheels:
     ----------
     torques : commands of each step; every wheel has its own part of them
     delay_ms : after a command until it acts; below 0, stamps look older than they are
+    later_ms : the same in the second half of the steps; None: as in the first
     stiff : part of a change of torque that the road takes at once
     """
 
-    def __init__(self, torques, delay_ms, *, stiff=0.0, start=900.0, noise=0.0, every_ms=PERIOD_MS):
+    def __init__(self, torques, delay_ms, *, later_ms=None, stiff=0.0, start=900.0, noise=0.0, every_ms=PERIOD_MS):
         self.torques = [(t, 0.9 * t, 1.1 * t, t) for t in torques]
         random = np.random.default_rng(1)
         speed, self.shown = [start] * 4, []
         for ms in range(PERIOD_MS * len(torques) + 100):
             if ms % every_ms == 0:
                 self.shown.append(tuple(w + noise * float(random.standard_normal()) for w in speed))
-            k = (ms - delay_ms) // PERIOD_MS
+            changed = later_ms is not None and 2 * ms >= PERIOD_MS * len(torques)
+            k = (ms - (later_ms if changed else delay_ms)) // PERIOD_MS
             acting = self.torques[min(max(k, 0), len(torques) - 1)]
             speed = [w + 1e-3 * (1.0 - stiff) * (t + 150.0) / i for w, t, i in zip(speed, acting, INERTIA, strict=True)]
 
@@ -68,6 +71,15 @@ def test_it_is_found_within_few_steps_through_the_noise_of_wheel_speeds(seed, tr
     assert all(abs(ms - true_ms) <= 5 for ms in found[15:])
 
 
+def test_what_was_seen_long_ago_is_forgotten():
+    """A delay that changes is found within `STEPS`, however long another was seen."""
+    for seed in range(20):
+        before = [torque for k in range(10) for torque in jumping(10 * seed + k, 300.0)]
+        found = Wheels(before * 2, 0, later_ms=15).found_ms()
+        assert not any(found[: len(before)])
+        assert abs(found[len(before) + STEPS] - 15) <= 5
+
+
 @given(st.integers(0, 99))
 def test_one_that_is_told_too_long_is_found_to_be_shorter(seed):
     assert Wheels(jumping(seed), 2).found_ms(told_ms=12)[-1] == -10
@@ -86,12 +98,16 @@ def test_torques_that_hardly_change_tell_nothing():
     assert not any(Wheels(torques, 15).found_ms())
 
 
-@pytest.mark.parametrize("start", [4.0, -4.0])
-def test_wheels_that_nearly_stand_tell_nothing(start):
-    still = Wheels(jumping(), 20, start=0.0)
-    slow = still.found_ms(change=lambda k, shown: tuple(start + 1e-3 * (w - start) for w in shown))
-    assert not any(slow)
-    assert Wheels(jumping(), 20, start=-900.0).found_ms()[-1] == 20
+@pytest.mark.parametrize(("speed_radps", "found_ms"), [(4.0, 0), (-4.0, 0), (0.0, 0), (20.0, 20), (-20.0, 20)])
+def test_wheels_that_nearly_stand_tell_nothing(speed_radps, found_ms):
+    wheels, found = Wheels(jumping(), 20), FoundDelay()
+    torques = [(k * PERIOD_MS * MS, torque) for k, torque in enumerate(wheels.torques)]
+    for k in range(1, STEPS):
+        pairs = zip(INERTIA, wheels.shown[k - 1], wheels.shown[k], strict=True)
+        turned = tuple(inertia * (after - before) * 1e3 / PERIOD_MS for inertia, before, after in pairs)
+        now_ns = k * PERIOD_MS * MS
+        found.learn(torques[:k], now_ns - PERIOD_MS * MS, now_ns, turned, (speed_radps,) * 4)
+    assert found.beyond_ns == found_ms * MS
 
 
 def test_where_the_road_takes_all_that_a_torque_changes_no_delay_is_told():
