@@ -30,6 +30,9 @@ MAX_SAMPLES = 2_000_000
 #: A drive that is longer is none: a date in the column, or another unit. It would be sampled a hundred times a second.
 MAX_DURATION_S = 100_000.0
 
+#: A step of a trace that is so many times its usual one, and longer than this, may be one that nobody recorded.
+_GAP_STEPS, _GAP_S = 10.0, 5.0
+
 #: A sensor at rest shows as little as this below zero: rest. Five times the noise of a logged speed, 0.2 km/h rms.
 REST_NOISE_MPS = 0.3
 
@@ -49,6 +52,7 @@ class Cycle:
     grade : float64[n], rise over run; zero where the file has no such column
     sha256 : hash of the file's bytes, or of the arrays if the cycle does not come from a file
     path : the file ("" if there is none)
+    gap : where the file may lack a part of the drive, in words; "" if it does not
     """
 
     name: str
@@ -57,6 +61,7 @@ class Cycle:
     grade: NDArray[np.float64] = attribute(repr=False)
     sha256: str
     path: str = ""
+    gap: str = ""
 
     @property
     def duration_s(self) -> float:
@@ -96,6 +101,7 @@ class Cycle:
             grade=np.interp(at, self.time_s, self.grade),
             sha256=self.sha256,
             path=self.path,
+            gap=self.gap,
         )
 
 
@@ -153,6 +159,7 @@ def load_cycle(path: Path | str) -> Cycle:
         grade=columns["grade"],
         sha256=sha256_of(path),
         path=str(path),
+        gap=_gap(path, places, columns["time_s"], columns["speed_mps"]),
     )
 
 
@@ -205,6 +212,22 @@ def _check_duration(path: Path | str, places: list[str], time_s: NDArray[np.floa
     if late.size:
         problem = f"time_s {time_s[late[0]]:g} is more than {MAX_DURATION_S:g} s after the first"
         raise ConfigError(path, places[late[0]], problem, "a drive in seconds")
+
+
+def _gap(path: Path | str, places: list[str], time_s: NDArray[np.float64], speed_mps: NDArray[np.float64]) -> str:
+    """The longest step in which a car moves and that is no step of this trace, in words; "" if there is none."""
+    steps = np.diff(time_s)
+    usual_s = float(np.median(steps))
+    moves = (speed_mps[1:] > 0.0) | (speed_mps[:-1] > 0.0)
+    found = np.flatnonzero(moves & (steps > _GAP_S) & (steps >= _GAP_STEPS * usual_s))
+    if not found.size:
+        return ""
+    at = int(found[np.argmax(steps[found])])
+    others = f", and {found.size - 1} more such" if found.size > 1 else ""
+    return (
+        f"{path}: {places[at + 1]}: is {steps[at]:.4g} s after the one before{others}, where {usual_s:.3g} s is usual: "
+        "taken for a straight line; if nobody recorded it, import_cycle --gaps cut leaves it out"
+    )
 
 
 def _unit_hint(columns: dict[str, NDArray[np.float64]]) -> str:

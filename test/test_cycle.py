@@ -53,6 +53,33 @@ def test_columns_may_come_in_any_order_with_comments_gaps_and_uneven_steps(write
     assert cycle.path == str(path)
 
 
+def gap_of(write, steps, speeds=None):
+    rows = zip(np.cumsum([0, *steps]), speeds or [10.0] * (len(steps) + 1), strict=True)
+    return load_cycle(write("time_s,speed_mps\n" + "".join(f"{t},{v}\n" for t, v in rows))).gap
+
+
+def test_the_longest_step_that_nobody_recorded_is_named_with_its_line(write):
+    gap = gap_of(write, [1, 1, 20, 1, 1, 501, 1])
+    assert "trip.csv: line 8: is 501 s after the one before, and 1 more such, where 1 s is usual" in gap
+    assert "import_cycle --gaps cut" in gap
+    assert "10 s after the one before, where 1 s" in gap_of(write, [1, 1, 10, 1])
+    assert "line 4: is 5.1 s" in gap_of(write, [0.1, 5.1, 0.1, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("steps", "speeds"),
+    [
+        ([500], None),  # two points are a cycle
+        ([10, 60, 10], None),
+        ([1, 1, 9.9, 1], None),
+        ([0.1, 0.1, 5, 0.1], None),
+        ([1, 600, 1, 1], [1, 0, 0, 1, 1]),  # standing is a straight line, whoever looks
+    ],
+)
+def test_a_step_of_a_traces_own_or_a_rest_is_no_gap(write, steps, speeds):
+    assert gap_of(write, steps, speeds) == ""
+
+
 def test_windows_line_ends_and_a_byte_order_mark_are_read(write):
     assert load_cycle(write(b"\xef\xbb\xbftime_s,speed_mps\r\n0,0\r\n1,1\r\n")).speed_mps.tolist() == [0.0, 1.0]
 

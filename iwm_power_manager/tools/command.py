@@ -10,15 +10,19 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from iwm_power_manager import __version__
 from iwm_power_manager.command_line import CommandParser
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.exit_codes import DONE, INTERRUPTED
 from iwm_power_manager.files import atomic_write, no_empty_remains
+
+if TYPE_CHECKING:
+    from iwm_power_manager.cycle import Cycle
+    from iwm_power_manager.vehicle import Vehicle
 
 
 def described(name: str, description: str, examples: str) -> CommandParser:
@@ -56,6 +60,18 @@ def ended(name: str, work: Callable[[], int | None], output: Path | str | None =
     except KeyboardInterrupt:
         print(f"{name}: interrupted; nothing half-written is left", file=sys.stderr)
         return INTERRUPTED
+
+
+def doubts(vehicle: Vehicle, cycles: Iterable[Cycle], frictions: Sequence[float]) -> list[str]:
+    """What a reader should know of a car and of the cycles it is to drive on these roads, each once."""
+    from iwm_power_manager.model.feasible import trace_warnings
+
+    lines = [f"note: {note}" for note in vehicle.notes]
+    for cycle in cycles:
+        lines += [f"warning: {cycle.gap}"] if cycle.gap else []
+        for friction in frictions:
+            lines += [f"warning: {vehicle.name}: {words}" for words in trace_warnings(cycle, vehicle.params, friction)]
+    return list(dict.fromkeys(lines))
 
 
 def plain(value: Any, digits: int = 17) -> Any:

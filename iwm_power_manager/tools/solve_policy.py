@@ -34,13 +34,12 @@ from iwm_power_manager.mdp.export import export_mdp
 from iwm_power_manager.mdp.policy_iteration import Iteration
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.mdp.transitions import build_model
-from iwm_power_manager.model.feasible import trace_warnings
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.replay.recorded import read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import Solved, load_grid, solve_one, targets
-from iwm_power_manager.tools.command import described, ended, note_replaced, output_file, picture, write_json
+from iwm_power_manager.tools.command import described, doubts, ended, note_replaced, output_file, picture, write_json
 from iwm_power_manager.tools.options import several
 from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import Vehicle, load_vehicle
@@ -131,7 +130,7 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="compute the Bellman residual of each policy after solving, and store it and what it proves in the file",
     )
-    output.add_argument("--quiet", action="store_true", help="print errors only")
+    output.add_argument("--quiet", action="store_true", help="print errors and warnings only")
     output.add_argument("--check", nargs="+", metavar="POLICY", help="verify policy files instead of solving")
     return result
 
@@ -161,7 +160,7 @@ def _solve(options: argparse.Namespace) -> int:
     say = _silent if options.quiet else print
 
     cycles = [load_cycle(resolve(path)) for path in options.cycle]
-    for line in (*(f"note: {note}" for note in vehicle.notes), *_doubts(cycles, vehicle, frictions)):
+    for line in doubts(vehicle, cycles, frictions):
         print(f"solve_policy: {line}", file=sys.stderr)
     note_replaced(*paths, *filter(None, [options.export_mdp]))
     sources = _sources(options, cycles, problem, vehicle)
@@ -216,12 +215,6 @@ def _problem(options: argparse.Namespace, vehicle: Vehicle) -> Problem:
         return problem
     discount = check_number("arguments", "--discount", options.discount, 0.0, 0.9999)
     return dataclasses.replace(problem, discount=discount)
-
-
-def _doubts(cycles: Sequence[Cycle], vehicle: Vehicle, frictions: Sequence[float]) -> list[str]:
-    """What of the cycles this car cannot follow, each once."""
-    found = (w for f in frictions for cycle in cycles for w in trace_warnings(cycle, vehicle.params, f))
-    return [f"warning: {vehicle.name}: {words}" for words in dict.fromkeys(found)]
 
 
 def _sources(options: argparse.Namespace, cycles: Sequence[Cycle], problem: Problem, vehicle: Vehicle) -> list[Source]:

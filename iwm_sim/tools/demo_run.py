@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,6 +35,8 @@ def run(plan: Plan) -> int:
     if plan.scenario:
         return run_scenario(plan)
     loaded = load(plan)
+    for line in command.doubts(loaded.vehicle, [loaded.cycle], [plan.friction]):
+        print(f"demo: {line}", file=sys.stderr)
     make_folder(make_folder(plan.output, new=True) / "log")
     vehicle = loaded.vehicle
     print(f"{vehicle.name} on {loaded.cycle.name}, friction {plan.friction:g}, idle drive {vehicle.idle_drive}")

@@ -196,7 +196,7 @@ def _add_output(group: argparse._ArgumentGroup) -> None:
         "with nothing else there",
     )
     group.add_argument("--save-series", metavar="DIR", help="a .npz for each case, with an array for each signal")
-    group.add_argument("--quiet", action="store_true", help="no progress, no table")
+    group.add_argument("--quiet", action="store_true", help="no progress, no table; warnings stay")
 
 
 def _add_modes(parent: argparse._ArgumentGroup) -> None:

@@ -17,8 +17,7 @@ from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write, make_folder
-from iwm_power_manager.model.feasible import trace_warnings
-from iwm_power_manager.tools.command import PICTURES, made_with, write_json, write_picture
+from iwm_power_manager.tools.command import PICTURES, doubts, made_with, write_json, write_picture
 from iwm_power_manager.tools.progress import Bar
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
 from iwm_sim.cluster import on_all_cores
@@ -41,6 +40,9 @@ from iwm_sim.tools.precompile import compile_for_a_drive
 def run(mode: str, options: argparse.Namespace) -> None:
     """Do what is asked for; `mode` is a key of `evaluate.MODES`, or "" for single cases."""
     options.say = silent if options.quiet else tell
+    if mode and options.cycle:
+        cycles = [cases.cycle_of(name) for name in options.cycle]
+        _tell_doubts(doubts(cases.vehicle_of(options.vehicle, ""), cycles, options.friction or []))
     _RUN[mode](options)
 
 
@@ -52,8 +54,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         raise ConfigError("arguments", "--cycle", "is missing", "one drive cycle or more, for instance nycc")
     started = time.perf_counter()
     wanted = planned(options)
-    for line in _doubts(wanted):
-        options.say(f"evaluate: {line}")
+    _tell_doubts(_doubts(wanted))
     with Progress(len(wanted), options.quiet) as progress:
         warm_up(wanted)
         wanted = with_rules(wanted, options.jobs)
@@ -70,13 +71,17 @@ def _evaluate(options: argparse.Namespace) -> None:
         options.say(f"rows: {options.json}")
 
 
+def _tell_doubts(lines: Sequence[str]) -> None:
+    for line in lines:
+        tell(f"evaluate: {line}")
+
+
 def _doubts(wanted: Sequence[Case]) -> list[str]:
     """What a reader should know of the cars and cycles before they are driven, each once."""
     lines: list[str] = []
     for case in wanted:
-        vehicle, cycle = cases.vehicle_of(case.vehicle, case.idle_drive, case.car), cases.cycle_of(case.cycle)
-        lines += [f"note: {note}" for note in vehicle.notes]
-        lines += [f"warning: {vehicle.name}: {w}" for w in trace_warnings(cycle, vehicle.params, case.friction)]
+        vehicle = cases.vehicle_of(case.vehicle, case.idle_drive, case.car)
+        lines += doubts(vehicle, [cases.cycle_of(case.cycle)], [case.friction])
     return list(dict.fromkeys(lines))
 
 

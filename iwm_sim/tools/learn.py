@@ -26,7 +26,7 @@ from iwm_power_manager.policy import save_policy
 from iwm_power_manager.replay.recorded import read_drives
 from iwm_power_manager.share import resolve
 from iwm_power_manager.solve import load_grid, targets
-from iwm_power_manager.tools.command import described, ended, made_with, note_replaced, output_file, write_json
+from iwm_power_manager.tools.command import described, doubts, ended, made_with, note_replaced, output_file, write_json
 from iwm_power_manager.tools.options import several, whole
 from iwm_power_manager.tools.progress import Bar
 from iwm_power_manager.vehicle import load_vehicle
@@ -115,7 +115,7 @@ def parser() -> argparse.ArgumentParser:
         "--jobs", type=whole(1, 1024), default=cores(), metavar="N", help="processes (default: one for each core)"
     )
     result.add_argument("--json", type=output_file, metavar="FILE", help="write the numbers, too")
-    result.add_argument("--quiet", action="store_true", help="print errors only")
+    result.add_argument("--quiet", action="store_true", help="print errors and warnings only")
     return result
 
 
@@ -143,6 +143,9 @@ def _learn(options: argparse.Namespace) -> None:
         if options.drive
         else [recorded_cycle(name, drive) for name, drive in recordings]
     )
+    given = [load_cycle(resolve(name)) for name in dict.fromkeys([*(options.cycle or ()), *(options.drive or ())])]
+    for line in doubts(vehicle, given, frictions):
+        print(f"learn_policy: {line}", file=sys.stderr)
     note_replaced(*paths)
     candidates = candidates_of(problem, options.weights, options.bandwidths)
     roads = []

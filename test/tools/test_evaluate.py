@@ -74,6 +74,14 @@ def test_json_goes_to_standard_output_where_it_is_asked_to(hill, capsys):
     assert json.loads(capsys.readouterr().out)["rows"][0]["strategy"] == "equal"
 
 
+@pytest.mark.parametrize("mode", [["--strategy", "equal"], ["--fit-battery", "--idle-drive", "none"]])
+def test_a_gap_in_a_cycle_is_said_whatever_is_printed(mode, tmp_path, capsys):
+    cycle = tmp_path / "tunnel.csv"
+    cycle.write_text("time_s,speed_mps\n0,9\n1,10\n2,10\n62,10\n63,9\n64,9\n")
+    assert evaluate.main(["--cycle", str(cycle), *mode, "--json", "-"]) == 0
+    assert f"warning: {cycle}: line 5: is 60 s after the one before" in capsys.readouterr().err
+
+
 def test_law_settings_reach_the_law(hill, tmp_path):
     out = tmp_path / "out.json"
     law = ["--gate-mode", "table2", "--no-gate-driving", "--switching-power", "5", "--critical-slip", "0.1"]

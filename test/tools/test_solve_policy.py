@@ -241,6 +241,13 @@ def test_a_bag_mixes_with_cycles_by_weight(grid, tmp_path, recorded):
     assert policy.chain.row_steps.sum() == pytest.approx(7649.0 + 10.0 * 5979.0, abs=20.0)
 
 
+def test_a_gap_in_a_cycle_is_said(tmp_path, grid, capsys):
+    cycle = tmp_path / "tunnel.csv"
+    cycle.write_text("time_s,speed_mps\n0,9\n1,10\n2,10\n62,10\n63,9\n64,9\n")
+    assert _solve(grid, "--friction", 0.5, "--output", tmp_path / "a.npz", "--quiet", cycle=cycle) == 0
+    assert f"warning: {cycle}: line 5: is 60 s after the one before" in capsys.readouterr().err
+
+
 def test_thin_and_missing_data_is_warned_about(tmp_path, grid, capsys):
     calm = tmp_path / "calm.csv"
     calm.write_text("time_s,speed_mps\n0,10\n60,10\n65,14\n")
