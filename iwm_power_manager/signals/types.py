@@ -10,15 +10,17 @@ from __future__ import annotations
 import os
 import re
 import sys
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import lru_cache
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from iwm_power_manager.errors import BagError
 
 if TYPE_CHECKING:
+    from rosbags.typesys.idl import IDLParser
+    from rosbags.typesys.msg import MSGParser
     from rosbags.typesys.store import Typestore
 
 MSG, IDL = "ros2msg", "ros2idl"
@@ -37,6 +39,7 @@ _ENCAPSULATION = 4
 _MAX_PADDING = 16
 
 _SEPARATOR = "=" * 80
+_ENUMERATION = re.compile(r"\benum\s+(\w+)\s*\{[^{}]*\}")
 #: How a text of wide characters may lie in CDR: DDS vendors and versions differ in the width and in what they count.
 _WIDE = ("uint16", "uint32", "uint8")
 
@@ -132,7 +135,7 @@ def _types_of(msgtype: str, encoding: str, text: str, wide: str) -> Types:
     except BagError as error:
         raise BagError(f"type {msgtype}: {error}") from None
     except Exception as error:  # noqa: BLE001 - parser and code generator raise anything at a text that is none
-        raise BagError(f"type {msgtype}: its definition cannot be read{_place(error)}") from None
+        raise BagError(f"type {msgtype}: its definition cannot be read{_problem(error)}") from None
     return Types(store, name)
 
 
@@ -156,6 +159,8 @@ def full_name(msgtype: str) -> str:
 
 def _parsed(name: str, encoding: str, text: str) -> dict[str, Any]:
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
+    from rosbags.typesys.idl import IDLParser
+    from rosbags.typesys.msg import MSGParser
 
     if len(text) > MAX_TEXT_BYTES:
         raise BagError(f"its definition has {len(text)} characters; allowed: <= {MAX_TEXT_BYTES}")
@@ -166,10 +171,46 @@ def _parsed(name: str, encoding: str, text: str) -> dict[str, Any]:
     text = re.sub("^={40,}$", _SEPARATOR, text, flags=re.MULTILINE)
     if encoding == MSG:
         text = re.sub("^MSG: *", "MSG: ", text, flags=re.MULTILINE)
-        # The grammar knows no bounded wstring; the bound is not in the bytes.
-        return dict(get_types_from_msg(re.sub(r"^(\s*wstring)<=\d+", r"\1", text, flags=re.MULTILINE), name))
+        # The grammar knows no bounded wstring, and a constant in small letters as one with a default: neither the bound
+        # nor a constant is in the bytes.
+        text = re.sub(r"^(wstring)<=\d+", r"\1", text, flags=re.MULTILINE)
+        text = re.sub(r"^[\w<=]+ +[a-z]\w* *=.*\n?", "", text, flags=re.MULTILINE)
+        with _saying_where(MSGParser, f"MSG: {name}\n{text}"):
+            return dict(get_types_from_msg(text, name))
     parts = [part.split("\n", 1)[1] for part in text.split(_SEPARATOR + "\n")[1:]] if _SEPARATOR in text else [text]
-    return dict(chain.from_iterable(get_types_from_idl(part).items() for part in parts))
+    # What a part names stands behind it, and has to be known before. Of an enumeration, CDR has its number.
+    text = _ENUMERATION.sub(r"typedef unsigned long \1", "\n".join(reversed(parts)))
+    with _saying_where(IDLParser, text):
+        return dict(get_types_from_idl(text))
+
+
+@contextmanager
+def _saying_where(kind: type[IDLParser | MSGParser], text: str) -> Iterator[None]:
+    """Name the line at which a parser gives up a text: not where it goes back to, but the furthest that it has come."""
+    try:
+        yield
+    except Exception as error:
+        if not str(error).startswith("Could not parse"):
+            raise
+        parser, reached = kind(text), 0
+
+        def watched(match: Callable[..., Any]) -> Callable[..., Any]:
+            def matched(at: int, *rest: Any) -> Any:
+                nonlocal reached
+                reached = max(reached, at)
+                return match(at, *rest)
+
+            return matched
+
+        for name in ("literal", "regex"):
+            setattr(parser, name, watched(getattr(parser, name)))
+        with suppress(Exception):
+            parser.specification()
+        # What is looked for at the start of a line of IDL may be missing at the end of the one before.
+        before = text[:reached] if text.startswith("MSG: ") else text[:reached].rstrip()
+        start = before.rfind("\n") + 1
+        line = " ".join(text[start : (text + "\n").index("\n", reached)].split())
+        raise BagError(f"its definition cannot be read, at {line[:80]!r}") from None
 
 
 def _needed(name: str, known: dict[str, Any], wide: str) -> dict[str, Any]:
@@ -262,10 +303,8 @@ def _measure(name: str, types: dict[str, Any]) -> None:
     size(name, 0)
 
 
-def _place(error: Exception) -> str:
-    """Where a parser stopped, without the whole text that rosbags puts into its message."""
+def _problem(error: Exception) -> str:
+    """What a parser says is wrong."""
     if isinstance(error, RecursionError):
         return ": is nested too deep"
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    where = [line for line in lines if not line.startswith("{\"'")]  # what a parser would have liked better
-    return f", at {where[-1][:80]!r}" if where else ""
+    return f": {str(error)[:80]!r}" if str(error) else ""

@@ -85,6 +85,46 @@ def test_what_cannot_be_read_is_refused_in_one_line_with_the_type(text: str, say
     assert len(str(caught.value)) < 300
 
 
+@pytest.mark.parametrize(
+    "line", ["float64 9x", "float64", "float64[ a", "float64 value;", 'string<=5 UNIT="x"', "float64 a 1 2", "---"]
+)
+def test_the_line_that_is_wrong_is_named_wherever_it_stands(line: str) -> None:
+    others = [f"float64 value_{i}" for i in range(4)]
+    for at in range(5):
+        with pytest.raises(BagError) as caught:
+            types_of(
+                "m/msg/A", "ros2msg", "\n".join([*others[:at], line, *others[at:], LINE, "MSG: m/B", "int8 a", ""])
+            )
+        assert str(caught.value) == f"type m/msg/A: its definition cannot be read, at {line!r}"
+
+
+@pytest.mark.parametrize("line", ["double a:", "double", "map<string, long> a;", "double a[;", "fixed<1,2> a;"])
+def test_the_line_of_an_idl_that_is_wrong_is_named(line: str) -> None:
+    with pytest.raises(BagError, match="cannot be read, at") as caught:
+        types_of("my_msgs/msg/Speed", "ros2idl", IDL.replace("double value;", f"\ndouble b;\n{line}\ndouble value;\n"))
+    assert line in str(caught.value)
+
+
+def test_what_is_no_place_in_a_definition_is_said_as_it_is() -> None:
+    with pytest.raises(BagError, match=r"cannot be read: 'Multidimensional arrays are not supported'"):
+        types_of("my_msgs/msg/Speed", "ros2idl", IDL.replace("value;", "value[2][3];"))
+
+
+def test_a_constant_in_small_letters_is_no_field() -> None:
+    types = types_of("m/msg/A", "ros2msg", "int32 a = 5\nuint8 lower=1\nstring text=a b\nfloat64 value\n")
+    assert types.deserialize(HEADER + struct.pack("<d", 9.5)).value == 9.5
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_an_enumeration_is_its_number(apart: bool) -> None:
+    enum = "enum Gear { PARK, /* a */\n DRIVE };"
+    own = f"{LINE}\nIDL: my_msgs/msg/Gear\nmodule my_msgs {{ module msg {{ {enum} }}; }};\n" if apart else ""
+    before = "" if apart else enum
+    text = IDL.replace("struct Speed {", f"{before} struct Speed {{ my_msgs::msg::Gear gear; Gear all[2];") + own
+    message = types_of("my_msgs/msg/Speed", "ros2idl", text).deserialize(HEADER + struct.pack("<3I4xd", 1, 0, 1, 9.5))
+    assert (message.gear, list(message.all), message.value) == (1, [0, 1], 9.5)
+
+
 @pytest.mark.parametrize("name", ["", "A", "../etc/passwd", "a/msg/B\nimport os", "a/b/c/d/e", "a/msg/", "1/2/3"])
 def test_a_name_that_is_none_is_refused(name: str) -> None:
     with pytest.raises(BagError, match="is no name of a message type"):
