@@ -6,10 +6,11 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
 from iwm_power_manager.mdp.demand import DemandChain
@@ -73,6 +74,35 @@ class Drawn(NamedTuple):
         number = re.match(r"figure_0?(\d+)", self.file)
         name = number[1] if number else {"transition_matrix": "transitions"}.get(self.file, self.file)
         return f"evaluate --figure {name} --plot {self.file}.pdf"
+
+    def data(self) -> list[dict[str, Any]]:
+        """What is drawn, as numbers: a mapping for each panel with its axes, curves and, of a map, its values.
+
+        The values of a map lie between the edges `x` and `y`, a row for each step of `y`.
+        """
+        panels: list[dict[str, Any]] = []
+        shown = [axes for axes in self.figure.axes if axes.get_label() != "<colorbar>"]
+        for i, axes in enumerate(shown):
+            maps = []
+            for mesh in axes.collections:
+                if isinstance(mesh, QuadMesh):
+                    edges = np.asarray(mesh.get_coordinates())
+                    maps.append({"x": edges[0, :, 0], "y": edges[:, 0, 1], "values": mesh.get_array()})
+            curves = []
+            for line in axes.lines:
+                label = str(line.get_label())
+                x, y = map(np.asarray, line.get_data())
+                curves.append({"label": "" if label.startswith("_") else label, "x": x, "y": y})
+            panels.append(
+                {
+                    "title": axes.get_title("left") or axes.get_title(),
+                    "x": next(filter(None, (below.get_xlabel() for below in shown[i:])), ""),  # of the lowest, for all
+                    "y": axes.get_ylabel(),
+                    "curves": curves,
+                    "maps": maps,
+                }
+            )
+        return panels
 
     def captioned(self) -> Figure:
         """The figure with title and note above it, for where no page says them."""

@@ -69,7 +69,7 @@ _COMMON = {"--vehicle", "--policy", "--jobs", "--quiet"}
 MODES = {
     "study": _COMMON | {"--study", "--update-doc"},
     "paper": _COMMON | {"--paper", "--cycle", "--idle-drive", "--json"},
-    "figure": {"--figure", "--plot", "--vehicle", "--quiet"},
+    "figure": {"--figure", "--plot", "--json", "--vehicle", "--quiet"},
     "ablation": _COMMON | {"--ablation", "--json"},
     "frontier": {"--frontier", "--vehicle", "--idle-drive", "--cycle", "--friction", "--budgets"}
     | {"--json", "--quiet"},

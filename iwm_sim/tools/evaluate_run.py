@@ -231,15 +231,21 @@ def _policies_text(policies: Policies) -> str:
 
 
 def _figure(options: argparse.Namespace) -> None:
-    if not options.plot:
-        raise ConfigError("arguments", "--plot", "is missing", f"a file that ends in {', '.join(PICTURES)}")
+    if not (options.plot or options.json):
+        allowed = f"a file that ends in {', '.join(PICTURES)}, or --json"
+        raise ConfigError("arguments", "--plot", "is missing", allowed)
     policies = Policies(options.vehicle, options.policy, options.say)
     drawn = single.figure(options.figure, policies, options.jobs)
-    write_picture(options.plot, drawn.captioned())
+    panels = drawn.data()
+    if options.plot:
+        write_picture(options.plot, drawn.captioned())
     if not options.quiet:
-        print(f"{drawn.title}. {drawn.note}\npicture: {options.plot}")
+        print(f"{drawn.title}. {drawn.note}" + (f"\npicture: {options.plot}" if options.plot else ""))
         if policies.used:
             print(_policies_text(policies))
+    if options.json:
+        about = {"package_version": __version__, "title": drawn.title, "note": drawn.note}
+        write_json(options.json, about | {"panels": panels})
 
 
 def _ablation(options: argparse.Namespace) -> None:

@@ -7,14 +7,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
+from iwm_power_manager.tools.command import plain
 from iwm_sim.study import reproduce, single, unseen, variants
 from iwm_sim.study.content import Study
 from iwm_sim.study.frontier import Frontier, Point
+from iwm_sim.study.study_figures import Drawn
 from iwm_sim.tools import evaluate, evaluate_run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -195,6 +198,26 @@ def test_a_figure_without_a_result_is_refused_with_what_it_shows(name, words, ca
     with pytest.raises(SystemExit):
         evaluate.main(["--figure", name, "--plot", "a.svg"])
     assert f"figure {name} is {words}" in capsys.readouterr().err
+
+
+def test_what_a_figure_draws_is_there_as_numbers(capsys):
+    assert evaluate.main(["--figure", "10", "--json", "-"]) == 0
+    drawn = json.loads(capsys.readouterr().out)
+    assert "Figure 10" in drawn["title"] and "idle drive none" in drawn["note"]
+    assert [panel["curves"][0]["label"] for panel in drawn["panels"]] == ["1 kW", "5 kW", "10 kW"]
+    for panel in drawn["panels"]:
+        assert (panel["x"], panel["y"]) == ("Power of the front axle, kW", "ΔSoC per step, %")
+        curve = panel["curves"][0]
+        assert len(curve["x"]) == len(curve["y"]) > 20
+        assert f"{max(curve['x']):.2g} kW" == curve["label"]
+
+
+def test_a_map_of_a_figure_has_its_values_between_its_edges(tmp_path):
+    figure, axes = plt.subplots()
+    axes.pcolormesh([0, 1, 2], [5, 6], [[0.25, 0.75]])
+    (panel,) = Drawn("a_map", "A map", "", figure).data()
+    (drawn,) = plain(panel)["maps"]
+    assert drawn == {"x": [0, 1, 2], "y": [5, 6], "values": [[0.25, 0.75]]}
 
 
 def test_a_figure_needs_a_file(capsys):
