@@ -6,7 +6,9 @@ A saving counts only where the run and that of equal split held the trace over t
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -266,9 +268,10 @@ def make(folder: Path, page: Path, picture: Path | None = None, numbers: str | N
     store = Store(folder)
     made, savings = page_of(store)
     write_page(page, made)
-    if savings:
-        print(plain_table(savings, _SAVINGS))
-    print(f"page: {page}")
+    with redirect_stdout(sys.stderr if numbers == "-" else sys.stdout):  # nothing else in what a program is to read
+        if savings:
+            print(plain_table(savings, _SAVINGS))
+        print(f"page: {page}")
     if picture:
         write_picture(picture, distribution(store.table(Drive).to_pylist()))
     if numbers:

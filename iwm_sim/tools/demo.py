@@ -11,6 +11,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -20,7 +21,7 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES, d
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.exit_codes import INTERRUPTED
 from iwm_power_manager.model.parameters import IDLE_DRIVES
-from iwm_power_manager.tools.command import output_file
+from iwm_power_manager.tools.command import output_file, write_json
 from iwm_power_manager.tools.options import number
 from iwm_power_manager.tools.progress import show_compiling
 
@@ -98,7 +99,12 @@ def parse(arguments: Sequence[str] | None = None) -> Plan:
     parser.add_argument(
         "--output", metavar="DIR", type=Path, help="folder for everything that is made (default: runs/<date and time>)"
     )
-    parser.add_argument("--json", metavar="FILE", type=output_file, help="also write the result's rows here")
+    parser.add_argument(
+        "--json",
+        metavar="FILE",
+        type=output_file,
+        help="also write the result's rows here; - for standard output, with nothing else there",
+    )
     parser.add_argument("--animate", metavar="GIF", type=Path, help="also draw the drive as a moving picture")
     given = parser.parse_args(arguments)
     if given.animate and (given.scenario or given.animate.suffix != ".gif"):
@@ -124,7 +130,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for wanted in (signal.SIGINT, signal.SIGTERM):
         signal.signal(wanted, _terminated)
     try:
-        return run(plan)
+        with redirect_stdout(
+            sys.stderr if plan.json == "-" else sys.stdout
+        ):  # nothing else in what a program is to read
+            code, content = run(plan)
+        if plan.json:
+            write_json(plan.json, content)
+        return code
     except KeyboardInterrupt:
         what = "what was recorded" if (plan.output / "bag").is_dir() else "the log"
         kept = f"; {what} stays in {plan.output}" if plan.output.is_dir() else ""

@@ -30,8 +30,8 @@ _REAL_TIME = "in real time"
 _ONE_PROCESS = "one process"
 
 
-def run(plan: Plan) -> int:
-    """Do all of it; returns the exit code: `FAILED` if the bag lacks anything that was published."""
+def run(plan: Plan) -> tuple[int, dict[str, Any]]:
+    """Do all of it; returns the exit code, `FAILED` if the bag lacks anything that was published, and what JSON has."""
     if plan.scenario:
         return run_scenario(plan)
     loaded = load(plan)
@@ -55,7 +55,7 @@ def run(plan: Plan) -> int:
     return show(plan, loaded, driven_run, reference, remarks, outcome)
 
 
-def run_scenario(plan: Plan) -> int:
+def run_scenario(plan: Plan) -> tuple[int, dict[str, Any]]:
     """Drive a scenario over DDS and say what it requires; the exit code is `FAILED` if that or the bag falls short."""
     scenario = load_scenario(plan.scenario, plan.idle_drive or None)
     plan = dataclasses.replace(plan, vehicle=str(scenario.vehicle.path), friction=scenario.assumed_friction)
@@ -68,16 +68,16 @@ def run_scenario(plan: Plan) -> int:
     print(f"\n{text(result)}")
     for remark in outcome.remarks:
         print(remark)
-    if plan.json:
-        command.write_json(plan.json, result.values)
-    return DONE if outcome.complete and result.passed else FAILED
+    return DONE if outcome.complete and result.passed else FAILED, result.values
 
 
 # --- the result -----------------------------------------------------------------------------------------------------
 
 
-def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str], outcome: Outcome) -> int:
-    """Write page and JSON, print table and paths; returns the exit code."""
+def show(
+    plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str], outcome: Outcome
+) -> tuple[int, dict[str, Any]]:
+    """Write page and JSON, print table and paths; returns the exit code and what stands in the JSON."""
     params = loaded.vehicle.params
     driven = Driven(plan.strategy, _REAL_TIME if plan.realtime else _LOCK_STEP, run, metrics.measure(run, params))
     other = Driven(REFERENCE, _ONE_PROCESS, reference, metrics.measure(reference, params))
@@ -95,8 +95,6 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
     write_page(plan.output / "drive.html", page)
     content = {"rows": rows, "settings": settings, "remarks": remarks}
     command.write_json(plan.output / "result.json", content)
-    if plan.json:
-        command.write_json(plan.json, content)
     print(f"\n{plain_table(rows, COLUMNS, screen())}\n\n{made_with(plan, loaded)}")
     for remark in remarks:
         print(remark)
@@ -113,7 +111,7 @@ def show(plan: Plan, loaded: Loaded, run: Run, reference: Run, remarks: list[str
             f"{loaded.cycle.name}, friction {plan.friction:g}, idle drive {loaded.vehicle.idle_drive}, {plan.strategy}",
         )
         print(f"moving picture: {plan.animate}")
-    return DONE if outcome.complete else FAILED
+    return DONE if outcome.complete else FAILED, content
 
 
 def made_with(plan: Plan, loaded: Loaded) -> str:

@@ -187,7 +187,8 @@ def _work(options: argparse.Namespace) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     options = parser().parse_args(argv)
-    return ended("fleet", lambda: _work(options), quiet=getattr(options, "quiet", False))
+    options.quiet = getattr(options, "quiet", False) or options.json == "-"  # nothing else in what a program is to read
+    return ended("fleet", lambda: _work(options), quiet=options.quiet)
 
 
 if __name__ == "__main__":

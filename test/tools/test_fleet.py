@@ -29,6 +29,9 @@ def test_a_small_fleet_is_driven_and_its_page_made(hill, tmp_path, capsys):
     assert fleet.main(["report", str(study)]) == 0
     assert (study / "fleet.html").exists()
     assert "instantaneous       2     2" in capsys.readouterr().out
+    for command in (["report", str(study)], drive):
+        assert fleet.main([*command, "--json", "-"]) == 0
+        assert {"savings", "drive"} & set(json.loads(capsys.readouterr().out))
 
 
 def test_a_misspelled_name_is_said_before_a_library_that_is_not_there(tmp_path, monkeypatch, capsys):
