@@ -104,6 +104,17 @@ class NoAnswerError(BagError):
 
 
 @contextmanager
+def of_parameter(name: str) -> Iterator[None]:
+    """What is wrong with a file, with the node's parameter that names it."""
+    try:
+        yield
+    except IwmError as error:
+        wrong = IwmError(f"parameter {name}: {str(error).removeprefix(f'{name}: ')}")
+        wrong.exit_code = error.exit_code
+        raise wrong from None
+
+
+@contextmanager
 def system_errors(path: Path | str, what: str, kind: type[BagError] = BagError) -> Iterator[None]:
     """What the system refuses meanwhile as the one line "path: what: reason"."""
     try:

@@ -34,7 +34,7 @@ from std_msgs.msg import Bool
 
 from iwm_power_manager.control.types import Wheels
 from iwm_power_manager.cycle import load_cycle
-from iwm_power_manager.errors import ConfigError, IwmError
+from iwm_power_manager.errors import ConfigError, IwmError, of_parameter
 from iwm_power_manager.exit_codes import DONE, FAILED
 from iwm_power_manager.model.parameters import IDLE_DRIVES
 from iwm_power_manager.ros import ending, qos
@@ -108,18 +108,17 @@ def _scenario(values: Mapping[str, Any]) -> Scenario:
     idle_drive = values["idle_drive"] or None
     until_s = values["until_s"] or math.inf
     if values["scenario_file"]:
-        scenario = load_scenario(values["scenario_file"], idle_drive)
+        with of_parameter("scenario_file"):
+            scenario = load_scenario(values["scenario_file"], idle_drive)
         if values["lockstep"] and any(fault.message for fault in scenario.faults):
             wrong = "has faults of messages, and lock-step waits for each as it is measured"
             raise ConfigError(scenario.path, "faults", wrong, "lockstep: false")
         return dataclasses.replace(scenario, duration_s=min(scenario.duration_s, until_s))
-    return on_cycle(
-        load_vehicle(resolve(values["vehicle_file"]), idle_drive),
-        load_cycle(resolve(values["cycle_file"])),
-        values["friction"],
-        values["initial_soc"],
-        until_s,
-    )
+    with of_parameter("vehicle_file"):
+        vehicle = load_vehicle(resolve(values["vehicle_file"]), idle_drive)
+    with of_parameter("cycle_file"):
+        cycle = load_cycle(resolve(values["cycle_file"]))
+    return on_cycle(vehicle, cycle, values["friction"], values["initial_soc"], until_s)
 
 
 class _Phase(enum.Enum):

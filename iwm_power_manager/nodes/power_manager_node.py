@@ -23,7 +23,7 @@ from rclpy.parameter import Parameter
 from iwm_power_manager.control.controller import Controller
 from iwm_power_manager.control.execution import COMPILED
 from iwm_power_manager.control.stepping import HELD_UP, Lockstep, RealTime, Taken
-from iwm_power_manager.errors import IwmError, one_line
+from iwm_power_manager.errors import IwmError, of_parameter, one_line
 from iwm_power_manager.nodes import neighbours, pace
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.announcements import Announcements, input_topics, silent_topics
@@ -187,7 +187,8 @@ class PowerManager(Starting):
     def _adopt(self, prepared: Prepared) -> None:
         """Drive with what was prepared; `ConfigError` if its topics get in each other's way."""
         own = [self.resolve_topic_name(topic) for topic in (NODE_STATE, NODE_FRICTION)]
-        prepared.mapping.check_topics(self.resolve_topic_name, own)
+        with of_parameter("signals_file"):
+            prepared.mapping.check_topics(self.resolve_topic_name, own)
         self._says.prepared(prepared)
         values = self._values
         self._wheel_names = tuple(values["wheel_names"])
@@ -205,7 +206,8 @@ class PowerManager(Starting):
             self._compiling = Compiling(values, prepared.load)
         if values["demand_log"]:
             path, period_s = Path(values["demand_log"]), values["demand_log_period_s"]
-            self._demand_log = DemandLog(path, period_s, self._controller.policy, prepared.vehicle.params)
+            with of_parameter("demand_log"):
+                self._demand_log = DemandLog(path, period_s, self._controller.policy, prepared.vehicle.params)
         rate_hz = None if self._lockstep else values["rate_hz"]
         brakes = "commanded" if prepared.mapping.commands[FRICTION] else "another system"
         car = {"vehicle": prepared.vehicle.name, "friction brakes": brakes}

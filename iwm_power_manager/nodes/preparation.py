@@ -19,7 +19,7 @@ from iwm_power_manager.control.execution import COMPILED, Execution, plain_pytho
 from iwm_power_manager.control.inputs import ValueLimits
 from iwm_power_manager.control.monitor import DEMAND
 from iwm_power_manager.control.thresholds import actuator_limits, for_car, input_limits, supervision_limits
-from iwm_power_manager.errors import BagError, ConfigError, IwmError, did_you_mean, spelled_like
+from iwm_power_manager.errors import BagError, ConfigError, IwmError, did_you_mean, of_parameter, spelled_like
 from iwm_power_manager.nodes import power_manager_config as config
 from iwm_power_manager.nodes.policy_choice import Policies, choose_policies
 from iwm_power_manager.ros import messages
@@ -80,10 +80,7 @@ def prepare(values: Mapping[str, Any], at_once: bool = True) -> Prepared:
         A file is missing or wrong, or a policy is of another car.
     """
     started_s = time.monotonic()
-    mapping = load_mapping(resolve(values["signals_file"]))  # first: wrong ones are not to wait for compiled code
-    mapping.check_live()
-    vehicle = load_vehicle(resolve(values["vehicle_file"]), values["idle_drive"] or None)
-    policies = choose_policies(values["policy_file"], values["strategy"], values["fallback"], values["rule"], vehicle)
+    mapping, vehicle, policies = _loaded(values)  # first: what is wrong is not to wait for compiled code
     names = tuple(values["wheel_names"])
     if values["signals_file"] == DEFAULT_MAPPING:
         mapping = mapping.with_wheel_names(names)
@@ -116,7 +113,8 @@ def prepare(values: Mapping[str, Any], at_once: bool = True) -> Prepared:
             warm(made(COMPILED))
 
     controller = made(plain_python())
-    readers, commands, assembly = _interface(mapping, controller, vehicle, values, limits.inputs.demand)
+    with of_parameter("signals_file"):
+        readers, commands, assembly = _interface(mapping, controller, vehicle, values, limits.inputs.demand)
     from iwm_power_manager.compilation import STORE, USES, NotKeptError, kept_only  # only now: it takes a moment
 
     used, can_wait = len(USES), False
@@ -144,6 +142,19 @@ def prepare(values: Mapping[str, Any], at_once: bool = True) -> Prepared:
         sum(not use.found for use in USES[used:]),
         load if can_wait else None,
     )
+
+
+def _loaded(values: Mapping[str, Any]) -> tuple[SignalMapping, Vehicle, Policies]:
+    """What stands in the files that the parameters name."""
+    with of_parameter("signals_file"):
+        mapping = load_mapping(resolve(values["signals_file"]))
+        mapping.check_live()
+    with of_parameter("vehicle_file"):
+        vehicle = load_vehicle(resolve(values["vehicle_file"]), values["idle_drive"] or None)
+    with of_parameter("policy_file"):
+        how = values["strategy"], values["fallback"], values["rule"]
+        policies = choose_policies(values["policy_file"], *how, vehicle)
+    return mapping, vehicle, policies
 
 
 def _keeps_up(controller: Controller, period_s: float) -> bool:

@@ -37,7 +37,7 @@ from iwm_power_manager.bags.recording import FAILED, Recording, RecordingOptions
 from iwm_power_manager.bags.recover import recover
 from iwm_power_manager.bags.writer import Sample, WriterOptions
 from iwm_power_manager.command_line import CommandParser
-from iwm_power_manager.errors import BagError, IwmError, one_line
+from iwm_power_manager.errors import BagError, IwmError, of_parameter, one_line
 from iwm_power_manager.exit_codes import CANNOT_TELL, DONE
 from iwm_power_manager.exit_codes import FAILED as EXIT_FAILED
 from iwm_power_manager.files import content_sha256
@@ -154,8 +154,9 @@ class Recorder(Node):
         self.recording = Recording(path, _options(values), _custom_data(values))
         if values["record"]:
             try:
-                self.recording.start()
-            except BagError:
+                with of_parameter("output"):
+                    self.recording.start()
+            except IwmError:
                 self.recording.close()  # its thread would keep this node, and with it DDS, alive
                 raise
 
@@ -175,8 +176,9 @@ class Recorder(Node):
 
     def _of_car(self, signals_file: str) -> tuple[list[str], list[str]]:
         """Topics that a signals file names, and those without which a closed loop cannot run."""
-        mapping = load_mapping(resolve(signals_file))
-        mapping.check_topics(self.resolve_topic_name)
+        with of_parameter("signals_file"):
+            mapping = load_mapping(resolve(signals_file))
+            mapping.check_topics(self.resolve_topic_name)
         commands = [sink.topic for sinks in mapping.commands.values() for sink in sinks]
         sources = [source.topic for signal in _LOOP for source in mapping.sources.get(signal, ())]
         return [*mapping.topics(), *commands], [*sources, *commands, POWER_MANAGER_STATE]
@@ -374,7 +376,8 @@ def _custom_data(values: Mapping[str, Any]) -> dict[str, str]:
         if values[f"{kind}_file"]:
             path = resolve(values[f"{kind}_file"])
             custom[f"{kind}_file"] = path.name
-            custom[f"{kind}_sha256"] = content_sha256(path)
+            with of_parameter(f"{kind}_file"):
+                custom[f"{kind}_sha256"] = content_sha256(path)
     for pair in filter(None, values["metadata"]):
         key, _, value = pair.partition("=")
         if not (key and value):

@@ -81,7 +81,10 @@ def test_a_file_that_cannot_be_gone_on_from_refuses_to_configure_and_stays_as_it
     path.write_bytes(content)
     assert bench.set_parameter("demand_log", str(folder / "none" / "demand.npz")) == ""
     assert not bench.change_state("configure")
-    assert f"{folder / 'none' / 'demand.npz'}: is in a folder that does not exist" in lockstep.running.text()
+    assert (
+        f"parameter demand_log: {folder / 'none' / 'demand.npz'}: is in a folder that does not exist"
+        in lockstep.running.text()
+    )
 
 
 def test_a_file_that_can_no_longer_be_written_is_reported_and_never_in_the_way(lockstep, folder) -> None:

@@ -35,9 +35,13 @@ def fails_with(folder: Path, args: list[str]) -> str:
 @pytest.mark.parametrize(
     ("parameters", "expected"),
     [
-        ({"policy_file": "/nowhere/policy.npz"}, "/nowhere/policy.npz: cannot be read"),
-        ({"policy_file": ""}, "policy_file: is empty"),
-        ({"strategy": "equal", "vehicle_file": "/nowhere/car.yaml"}, "/nowhere/car.yaml: cannot be read"),
+        ({"policy_file": "/nowhere/policy.npz"}, "parameter policy_file: /nowhere/policy.npz: cannot be read"),
+        ({"policy_file": ""}, "[power_manager]: parameter policy_file: is empty"),
+        (
+            {"strategy": "equal", "vehicle_file": "/nowhere/car.yaml"},
+            "parameter vehicle_file: /nowhere/car.yaml: cannot be read",
+        ),
+        ({"signals_file": "/nowhere/odom.yaml"}, "parameter signals_file: /nowhere/odom.yaml: cannot be read"),
         ({"rate_hz": 100}, "parameter rate_hz: 100 is not allowed; allowed: 10 to 1000 (double: write 100.0)"),
         ({"rate_hz": 2}, "parameter rate_hz: 2 is not allowed; allowed: 10 to 1000 (double)"),
         ({"friction": [2]}, "parameter friction: [2] is not allowed; allowed: 0.05 to 1.5 (double)"),

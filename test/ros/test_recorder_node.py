@@ -443,7 +443,10 @@ def test_into_a_read_only_folder_nothing_is_recorded_and_one_line_says_so(
     process = recorder(tmp_path / "bag", disk="ro,size=64k")
     process.process.wait(PATIENCE_S)
     code, error = process.end()
-    assert (code, error) == (BAD_INPUT, f"recorder: {tmp_path / 'bag'}: cannot be created: Read-only file system\n")
+    assert (code, error) == (
+        BAD_INPUT,
+        f"recorder: parameter output: {tmp_path / 'bag'}: cannot be created: Read-only file system\n",
+    )
 
 
 @pytest.mark.parametrize(
@@ -452,9 +455,13 @@ def test_into_a_read_only_folder_nothing_is_recorded_and_one_line_says_so(
         ("compression:=gzip", "parameter compression: 'gzip' is not allowed; allowed: none | lz4 | zstd"),
         ("flush_period_s:=100.0", "parameter flush_period_s: 100.0 is not allowed"),
         ("regex:=(", "parameter regex: '(' is no regular expression"),
-        ("policy_file:=/no/policy.npz", "/no/policy.npz: cannot be read: No such file or directory"),
+        (
+            "policy_file:=/no/policy.npz",
+            "parameter policy_file: /no/policy.npz: cannot be read: No such file or directory",
+        ),
         ("metadata:=[a]", "parameter metadata: 'a' is not allowed; allowed: key=value"),
-        ("output:=/proc/none/bag", "/proc/none/bag: cannot be created: No such file or directory"),
+        ("signals_file:=/no/odom.yaml", "parameter signals_file: /no/odom.yaml: cannot be read"),
+        ("output:=/proc/none/bag", "parameter output: /proc/none/bag: cannot be created: No such file or directory"),
         ("output:={existing}", "exists already and is not overwritten"),
     ],
 )

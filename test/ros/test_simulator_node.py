@@ -309,9 +309,12 @@ def test_commands_that_stop_leave_motors_off_and_brakes_at_the_pedal(stand_in) -
 @pytest.mark.parametrize(
     ("parameters", "expected"),
     [
-        ({"cycle_file": "/nowhere/cycle.csv"}, "/nowhere/cycle.csv: cannot be read"),
-        ({"vehicle_file": "/nowhere/car.yaml"}, "/nowhere/car.yaml: cannot be read"),
-        ({"scenario_file": "/nowhere/road.yaml"}, "/nowhere/road.yaml: cannot be read"),
+        ({"cycle_file": "/nowhere/cycle.csv"}, "simulator: parameter cycle_file: /nowhere/cycle.csv: cannot be read"),
+        ({"vehicle_file": "/nowhere/car.yaml"}, "simulator: parameter vehicle_file: /nowhere/car.yaml: cannot be read"),
+        (
+            {"scenario_file": "/nowhere/road.yaml"},
+            "simulator: parameter scenario_file: /nowhere/road.yaml: cannot be read",
+        ),
         (
             {"scenario_file": "demand_lost", "lockstep": "true"},
             "faults: has faults of messages, and lock-step waits for each as it is measured; allowed: lockstep: false",
