@@ -23,6 +23,9 @@ _KEEP_TIME = {
     )
 }
 
+#: In pytest's cache: the run of all other tests, which comes first, had none.
+_NONE_OF_THE_OTHERS = "make_test/none_of_the_others"
+
 # Continuous integration repeats the same examples: a change is judged by what it changes, not by luck.
 settings.register_profile("default", deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 settings.register_profile("nightly", settings.get_profile("default"), max_examples=20_000, derandomize=False)
@@ -83,6 +86,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    """`make test` runs these and the others in turn: with `-k` it may be that only one of both has any."""
-    if exitstatus == pytest.ExitCode.NO_TESTS_COLLECTED and "processes" in session.config.option.markexpr:
+    """`make test` runs the others and these in turn: with `-k` one of both may have none, but not both."""
+    chosen, cache = session.config.option.markexpr, getattr(session.config, "cache", None)
+    if "processes" not in chosen or cache is None or hasattr(session.config, "workerinput"):
+        return
+    none, of_the_others = exitstatus == pytest.ExitCode.NO_TESTS_COLLECTED, "not processes" in chosen
+    if none and (of_the_others or not cache.get(_NONE_OF_THE_OTHERS, False)):
         session.exitstatus = pytest.ExitCode.OK
+    if of_the_others:
+        cache.set(_NONE_OF_THE_OTHERS, none)
