@@ -69,7 +69,7 @@ def targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequenc
     except OSError as error:
         raise ConfigError("arguments", "--output", f"{output}: {error.strerror}", "a folder or a .npz file") from None
     stem = re.sub(r"[^a-z0-9]+", "_", f"{vehicle.name} {vehicle.idle_drive} {problem.name}".lower()).strip("_")
-    return [output / f"{stem}_mu{round(friction * 100):03d}.npz" for friction in frictions]
+    return [output / f"{stem}_mu{f'{100.0 * friction:.6g}'.zfill(3)}.npz" for friction in frictions]
 
 
 def solve_one(

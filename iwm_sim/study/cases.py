@@ -324,7 +324,8 @@ def check(case: Case) -> None:
 def save_series(folder: Path | str, made: Result) -> None:
     """Write what a result kept as a compressed .npz named after the case; `ConfigError` if it cannot be written."""
     case = made.case
-    name = f"{cycle_of(case.cycle).name}_{case.idle_drive}_mu{round(case.friction * 100):03d}_{case.name}.npz"
+    friction = f"{100.0 * case.friction:.6g}".zfill(3)
+    name = f"{cycle_of(case.cycle).name}_{case.idle_drive}_mu{friction}_{case.name}.npz"
     stream = io.BytesIO()
     np.savez_compressed(stream, allow_pickle=False, **made.series)
     atomic_write(Path(folder) / name, stream.getvalue())

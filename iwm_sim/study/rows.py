@@ -81,8 +81,10 @@ def comparable(one: Metrics, other: Metrics) -> bool:
 
 
 def saving_percent(one: Metrics, reference: Metrics) -> float | None:
-    """Energy saved against a reference, %; None where the distances differ, or one of the two lost the trace."""
-    if not (one.trace_held and reference.trace_held and comparable(one, reference)) or reference.energy_wh <= 0.0:
+    """Energy saved against a reference, %; None where it stood, the distances differ, or one of both lost the trace."""
+    if not (one.trace_held and reference.trace_held and comparable(one, reference)):
+        return None
+    if reference.distance_m <= 0.0 or reference.energy_wh <= 0.0:
         return None
     return 100.0 * (1.0 - one.energy_wh / reference.energy_wh)
 

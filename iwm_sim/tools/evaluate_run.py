@@ -15,6 +15,7 @@ from pathlib import Path
 from iwm_power_manager import __version__
 from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
+from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import atomic_write, make_folder
 from iwm_power_manager.tools.command import PICTURES, doubts, made_with, write_json, write_picture
@@ -40,8 +41,8 @@ from iwm_sim.tools.precompile import compile_for_a_drive
 def run(mode: str, options: argparse.Namespace) -> None:
     """Do what is asked for; `mode` is a key of `evaluate.MODES`, or "" for single cases."""
     options.say = silent if options.quiet else tell
-    if mode and options.cycle:
-        cycles = [cases.cycle_of(name) for name in options.cycle]
+    cycles = _distinct(options.cycle or ())
+    if mode and cycles:
         _tell_doubts(doubts(cases.vehicle_of(options.vehicle, ""), cycles, options.friction or []))
     _RUN[mode](options)
 
@@ -69,6 +70,17 @@ def _evaluate(options: argparse.Namespace) -> None:
     if options.json:
         write_json(options.json, {"package_version": __version__, "rows": rows})
         options.say(f"rows: {options.json}")
+
+
+def _distinct(names: Sequence[str]) -> list[Cycle]:
+    """The cycles of these names; refused, where results of two would have one name."""
+    known: dict[str, Cycle] = {}
+    for cycle in map(cases.cycle_of, names):
+        other = known.setdefault(cycle.name, cycle)
+        if other.sha256 != cycle.sha256:
+            problem = f"{other.source} and {cycle.source} are both called {cycle.name}"
+            raise ConfigError("arguments", "--cycle", problem, "files of different names")
+    return list(known.values())
 
 
 def _tell_doubts(lines: Sequence[str]) -> None:
@@ -312,7 +324,10 @@ def _frontier(options: argparse.Namespace) -> None:
             for friction in options.friction or [0.9]:
                 place = frontier.Place(f"{vehicle.name} on {cycle.name}", vehicle, cycle, friction)
                 found.append(unseen.budgets_of(place, options.budgets or frontier.BUDGETS_PER_MIN))
-                picture = folder / f"{vehicle.name}_{vehicle.idle_drive}_{cycle.name}_{round(friction * 100):03d}.svg"
+                picture = (
+                    folder
+                    / f"{vehicle.name}_{vehicle.idle_drive}_{cycle.name}_{f'{100.0 * friction:.6g}'.zfill(3)}.svg"
+                )
                 frontier_figure.draw_frontier(found[-1], picture)
                 if not options.quiet:
                     _show_frontier(found[-1], picture)

@@ -14,7 +14,7 @@ import pytest
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.tools.command import plain
-from iwm_sim.study import reproduce, single, unseen, variants
+from iwm_sim.study import cases, reproduce, single, unseen, variants
 from iwm_sim.study.content import Study
 from iwm_sim.study.frontier import Frontier, Point
 from iwm_sim.study.study_figures import Drawn
@@ -108,6 +108,30 @@ def test_series_are_saved_with_an_array_for_each_signal(hill, tmp_path):
     with np.load(folder / "hill_drag_mu090_equal.npz") as series:
         assert series["speed_mps"].max() == pytest.approx(10.0, abs=0.2)
         assert len(series["time_s"]) == len(series["soc"])
+
+
+def test_two_frictions_that_are_nearly_one_have_a_file_each(hill, tmp_path):
+    arguments = ["--cycle", str(hill), "--friction", "0.9", "0.901", "--strategy", "equal", "--quiet"]
+    assert evaluate.main([*arguments, "--save-series", str(tmp_path)]) == 0
+    assert len(list(tmp_path.glob("hill_drag_mu*_equal.npz"))) == 2
+
+
+def test_two_cycles_of_one_name_are_told_apart_or_refused(hill, tmp_path, capsys):
+    other = tmp_path / "hill.csv"
+    other.write_bytes(hill.read_bytes())
+    arguments = ["--cycle", str(hill), str(other), "--strategy", "equal", "--quiet"]
+    assert evaluate.main(arguments) == 0
+    other.write_bytes(hill.read_bytes() + b"# longer\n")
+    cases.cycle_of.cache_clear()
+    assert evaluate.main(arguments) == 2
+    assert f"--cycle: {hill} and {other} are both called hill" in capsys.readouterr().err
+
+
+def test_what_stands_saves_nothing(tmp_path, capsys):
+    parked = tmp_path / "parked.csv"
+    parked.write_text("time_s,speed_mps\n0,0\n20,0\n")
+    assert evaluate.main(["--cycle", str(parked), "--strategy", "instantaneous", "--json", "-"]) == 0
+    assert [row["saving_percent"] for row in json.loads(capsys.readouterr().out)["rows"]] == [None, None]
 
 
 def test_the_default_is_our_strategy_beside_equal_split_and_several_values_are_given_either_way(

@@ -88,6 +88,11 @@ def test_it_writes_one_verified_policy_for_each_road(grid, tmp_path, capsys):
     assert np.sum(numbers["demand"]["row_steps"]) == 5979.0
 
 
+def test_roads_that_are_nearly_one_have_a_policy_each(grid, tmp_path):
+    assert _solve(grid, "--friction", 0.9, 0.901, "--output", tmp_path / "bank", "--quiet") == 0
+    assert sorted(load_policy(path).friction for path in (tmp_path / "bank").iterdir()) == [0.9, 0.901]
+
+
 def test_verify_stores_the_residual_and_what_it_proves(grid, tmp_path, capsys):
     plain, verified, report = tmp_path / "plain.npz", tmp_path / "verified.npz", tmp_path / "run.json"
     assert _solve(grid, "--friction", 0.5, "--output", plain) == 0
