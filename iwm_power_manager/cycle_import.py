@@ -41,8 +41,8 @@ _TIME_NAMES = {
     "h": r"(?<![a-z])h\b|hours",
     "s": r"\[s\]|\(s\)|_s\b|sec",
 }
-
-
+#: Speeds that a log has beside the car's.
+_NOT_OF_CAR = r"limit|target|desired|(?<![a-z])set|(?<![a-z])max|av(g|erage)|mean|wind|soll"
 _SLOPE = r"grade|slope|gradient|incline|steigung|neigung|pente"
 
 
@@ -122,15 +122,20 @@ def read_log(
     """
     table = _with_units(read_table(path, separator, decimal))
     line, header = table.rows[0]
-    columns = {
-        "time": _column(table, header, "time", time, r"time|stamp|\bt(?![a-z0-9])|zeit"),
-        "speed": _column(table, header, "speed", speed, r"speed|veloc|\bv(?![a-z0-9])|geschw|vitesse", _UNIT_NAMES),
+    found = {
+        "time": _columns(table, header, "time", time, r"time|stamp|\bt(?![a-z0-9])|zeit"),
+        "speed": _columns(table, header, "speed", speed, r"speed|veloc|\bv(?![a-z0-9])|geschw|vitesse", _UNIT_NAMES),
     }
     slopes = [cell for cell in header if re.search(_SLOPE, cell, re.IGNORECASE)]
     grade = grade or next((cell for cell in slopes if cell.lower() == "grade"), "")
     if grade:
-        columns["grade"] = _column(table, header, "grade", grade, "")
+        found["grade"] = _columns(table, header, "grade", grade, "")
+    columns = {name: those[0] for name, those in found.items()}
     said = [f"columns: {', '.join(f'{name} is {header[i]!r}' for name, i in columns.items())}"]
+    for name, (_, *others) in found.items():
+        if others:
+            named = ", ".join(repr(header[i]) for i in others)
+            said.append(f"{named} look{'s' * (len(others) == 1)} like {name}, too: --{name} takes another column")
     if slopes and not grade:
         said.append(f"{slopes[0]!r} is left out: --grade takes it, as rise over run")
     if table.decimal == ",":
@@ -201,22 +206,28 @@ def _rising(path: Path | str, time: FloatArray, clock: bool, said: list[str]) ->
     return rising
 
 
-def _column(
+def _columns(
     table: Table, header: list[str], what: str, name: str, pattern: str, units: dict[str, str] | None = None
-) -> int:
-    """Index of a column: the one that is named, else the first that looks like it, rather one that names a unit.
+) -> list[int]:
+    """Indices of the columns of this name, else of those that look like it, likest first: rather one that names a unit.
 
-    One that is empty is the last choice.
+    One that is empty is the last choice, and before it a speed that is not the car's.
     """
     wanted = [i for i, cell in enumerate(header) if (cell == name if name else re.search(pattern, cell, re.IGNORECASE))]
-    wanted.sort(key=lambda i: (all(map(is_nothing, _cells(table, i))), not _named(header[i], units or {})))
+    wanted.sort(
+        key=lambda i: (
+            all(map(is_nothing, _cells(table, i))),
+            bool(units and re.search(_NOT_OF_CAR, header[i], re.IGNORECASE)),
+            not _named(header[i], units or {}),
+        )
+    )
     if not wanted:
         where = f"line {table.rows[0][0]}"
         if not any(re.search(r"[^\W\d_]", cell) for cell in header):
             raise ConfigError(table.path, where, "has no header", "a first line that names the columns")
         problem = f"has no column {name!r}" if name else f"has no column that looks like {what}: name it with --{what}"
         raise ConfigError(table.path, where, problem, ", ".join(header))
-    return wanted[0]
+    return wanted
 
 
 def _cells(table: Table, column: int) -> list[str]:

@@ -167,6 +167,15 @@ def test_of_columns_that_look_like_speed_the_one_with_a_unit_is_taken(tmp_path, 
     assert "speed is 'speed_kmh'" in out
 
 
+@pytest.mark.parametrize("other", ["Speed limit (km/h)", "target_speed_kmh", "avg speed [km/h]"])
+def test_a_speed_that_is_not_the_cars_is_not_taken_and_others_are_said(tmp_path, capsys, other):
+    log = log_of(tmp_path / "log.csv", ("time_s", other, "Speed"), [(t, 50.0, 3.6 * t) for t in range(10)])
+    code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv", "--speed-unit", "km/h")
+    assert code == 0
+    assert f"speed is 'Speed'\n{log}: {other!r} looks like speed, too: --speed takes another column" in out
+    assert "looks like" not in run(capsys, log, "--output", tmp_path / "trip.csv", "--speed", "Speed")[1]
+
+
 def test_a_clock_that_passes_midnight_goes_on_and_one_set_back_is_refused(tmp_path, capsys):
     start = datetime.datetime(2024, 5, 1, 23, 55)
     clocks = [(start + datetime.timedelta(seconds=t)).strftime("%H:%M:%S") for t in NYCC.time_s]
