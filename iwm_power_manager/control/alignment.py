@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from operator import sub
 
 from iwm_power_manager.control.found_delay import FoundDelay
 from iwm_power_manager.control.types import Command, Measurement, Wheels
@@ -71,7 +72,7 @@ class Alignment:
     def applied(self, now_ns: int, torque_nm: Wheels) -> None:
         """Note the torques that are commanded now."""
         torques = self._torques
-        if torques and max(abs(a - b) for a, b in zip(torque_nm, torques[-1][1], strict=True)) > _LIVELY_NM:
+        if torques and max(map(abs, map(sub, torque_nm, torques[-1][1]))) > _LIVELY_NM:
             self._lively_ns = now_ns
         torques.append((now_ns, torque_nm))
         # Of speeds that are as old as may be, since those before, which may be as much older.
@@ -122,11 +123,11 @@ class Alignment:
         return a, b, c, d
 
     def _learn(self, stamp_ns: int, turned_nm: Wheels, speed_radps: Wheels) -> None:
-        if stamp_ns - self._lively_ns > _LIVELY_NS:
-            self.found.rest(self._torques[-1][1], turned_nm)
-            return
         from_ns, to_ns = self._since_ns - self._delay_ns, stamp_ns - self._delay_ns
-        self.found.learn(self._torques, from_ns, to_ns, turned_nm, speed_radps)
+        if stamp_ns - self._lively_ns > _LIVELY_NS:
+            self.found.rest(from_ns, to_ns, turned_nm)
+        else:
+            self.found.learn(self._torques, from_ns, to_ns, turned_nm, speed_radps)
 
     def _weighted_nm(self, from_ns: int, to_ns: int, weights: Sequence[float]) -> Wheels:
         """Mean of the torques by which a speed has changed that is made of several messages."""

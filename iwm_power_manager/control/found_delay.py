@@ -20,6 +20,7 @@ FloatArray = npt.NDArray[np.float64]
 #: Delays that are compared, beyond what is told, ns. One that is too short by 8 ms is borne, too long by 3 is not.
 BEYOND_NS = np.arange(-20_000_000, 30_000_001, 2_500_000)
 _TOLD = int(np.flatnonzero(BEYOND_NS == 0)[0])
+_SHORTEST_NS, _LONGEST_NS = int(BEYOND_NS[0]), int(BEYOND_NS[-1])
 #: A torque that changes by less from step to step tells nothing beside the noise of wheel speeds, N m.
 TELLING_NM = 100.0
 #: Wheels that are slower tell nothing: they stand, or are about to, rad/s.
@@ -52,16 +53,16 @@ class FoundDelay:
         # By delay and wheel: squared changes of what is left to the road, and of the torque.
         self._left = np.zeros((len(BEYOND_NS), 4))
         self._swung = np.zeros((len(BEYOND_NS), 4))
-        self._before: tuple[FloatArray, FloatArray] | None = None
+        self._before: tuple[int, int, Wheels] | None = None
 
     @property
     def beyond_ns(self) -> int:
         """What was found, beyond what is told."""
         return int(BEYOND_NS[self._chosen])
 
-    def rest(self, torque_nm: Wheels, turned_nm: Wheels) -> None:
-        """A step in which all delays tell the same torque."""
-        self._before = np.array([torque_nm]), np.array(turned_nm)
+    def rest(self, from_ns: int, to_ns: int, turned_nm: Wheels) -> None:
+        """A step in which all delays tell much the same torque; arguments as of `learn`."""
+        self._before = from_ns, to_ns, turned_nm
 
     def learn(
         self, torques: Sequence[tuple[int, Wheels]], from_ns: int, to_ns: int, turned_nm: Wheels, speed_radps: Wheels
@@ -75,15 +76,17 @@ class FoundDelay:
         turned_nm : what turned the wheels: inertia times change
         speed_radps : of the wheels
         """
-        after = _means_nm(torques, from_ns, to_ns), np.array(turned_nm)
-        before, self._before = self._before, after
+        before, self._before = self._before, (from_ns, to_ns, turned_nm)
         if before is None:
             return
-        changes = after[0] - before[0]
+        acting = _acting(torques, before[0] - _LONGEST_NS, to_ns - _SHORTEST_NS)
+        if all(max(wheel) - min(wheel) <= TELLING_NM for wheel in zip(*[nm for _, nm in acting], strict=True)):
+            return
+        changes = _means_nm(acting, from_ns, to_ns) - _means_nm(acting, *before[:2])
         telling = (np.abs(changes).max(axis=0) > TELLING_NM) & (np.abs(speed_radps) > TURNING_RADPS)
         if telling.any():
             kept = np.where(telling, KEPT, 1.0)
-            self._left = kept * self._left + telling * (changes - (after[1] - before[1])) ** 2
+            self._left = kept * self._left + telling * (changes - np.subtract(turned_nm, before[2])) ** 2
             self._swung = kept * self._swung + telling * changes**2
             self._choose()
 
@@ -97,6 +100,17 @@ class FoundDelay:
             if left[self._chosen] > worse * left[best] + LEAST_NM2:
                 alike = np.flatnonzero(explaining & (left <= SHORTER * left[best] + LEAST_NM2))
                 self._chosen = int(alike[np.abs(alike - self._chosen).argmin()])
+
+
+def _acting(torques: Sequence[tuple[int, Wheels]], from_ns: int, to_ns: int) -> list[tuple[int, Wheels]]:
+    """Those of the torques that act between two times."""
+    acting = []
+    for torque in reversed(torques):
+        if torque[0] < to_ns:
+            acting.append(torque)
+        if torque[0] <= from_ns:
+            break
+    return acting[::-1] or [torques[0]]
 
 
 def _means_nm(torques: Sequence[tuple[int, Wheels]], from_ns: int, to_ns: int) -> FloatArray:
