@@ -4,8 +4,8 @@
 Every measure is a function of a finished run; `NAMES` are what a scenario's `require` may bound. Those of a braking
 begin when the driver first asks for braking and end at standstill or at the end. Several are those of UN Regulation No.
 13-H, Annex 6 (tests of vehicles with anti-lock systems; Appendix 2, utilisation of adhesion; Appendix 3, performance on
-differing adhesion surfaces), in EUR-Lex 2026/502. Its table of contents was read, its paragraphs were not: their
-numbers are therefore not cited, and the bounds are as they are commonly quoted.
+differing adhesion surfaces), in EUR-Lex 2026/502. Which paragraph asks for what, and what of it was read, is in
+`docs/safety.md`.
 """
 
 from __future__ import annotations
