@@ -13,11 +13,15 @@ from iwm_power_manager.motor_map import COLUMNS, RANGES
 from iwm_power_manager.tables import Table, is_nothing, read_table
 
 RAD_S_PER_RPM = 2.0 * math.pi / 60.0
+_GUESSED = "rad/s, guessed"
 _SPEED_NAMES = {"rpm": r"\brpm|1/min|min-1|min\^-1|u/min", "rad/s": r"rad ?/?s\b|rad ?per ?s|radps"}
 #: Units that are not read, by what the option that settles it is.
 _OTHER_UNITS = {
-    "speeds": (r"km[/ ]?h\b|\b[km]ph|\bm/s|\bkrpm|\brps|\b1/s|\bs\^?-1|\bhz\b|(deg|°)/s", "rad/s or rpm: --speed-unit"),
-    "torques": (r"\b[km]n[ ·*]?m\b|\blbf?|\bft\b|\boz", "N m"),
+    "speeds": (
+        r"km[/ ]?h\b|\b[km]ph|\bm/s|\bkrpm|\brps|\b1/s|\bs\^?-1|\bhz\b|(deg|°)/s|speed\W*(%|pu\b)",
+        "rad/s or rpm: --speed-unit",
+    ),
+    "torques": (r"\b[km]n[ ·*]?m\b|\blbf?|\bft\b|\boz|torque\W*(%|percent|pu\b)", "N m"),
     "losses": (r"\b[km]w\b", "W"),
 }
 #: What the head of a column says of it.
@@ -32,6 +36,8 @@ _MIXED = 0.02
 #: A loss so many times that between its neighbours, or so little of it, is a wrong number.
 _APART = 8.0
 _MOST_ALONE = 5
+#: Speeds of no unit that go further than this, rad/s, may be in rpm: a wheel's at 350 km/h do not.
+_MOST_UNNAMED = 300.0
 #: No car's motor has more, N m: those are speeds, or N mm.
 _MOST_NM = 5000.0
 
@@ -113,6 +119,9 @@ def read_points(
         if key in points:
             raise ConfigError(path, f"line {line}", f"repeats speed {speed:g}, torque {torque:g}")
         points[key] = _efficiency(path, line, key, value / 100.0 if percent else value, quantity)
+    fastest = max((speed for speed, _ in points), default=0.0) * gear
+    if speed_unit == _GUESSED and fastest > _MOST_UNNAMED:
+        doubts.append(f"speeds up to {fastest:g} of no unit are taken for rad/s: rpm? --speed-unit says it")
     most_nm = max((abs(torque) for _, torque in points), default=0.0) / gear
     if most_nm > _MOST_NM:
         doubts.append(f"torques up to {most_nm:g} N m at the motor: {'--down' if layout == 'matrix' else 'unit'}?")
@@ -202,7 +211,7 @@ def _speed_unit(path: Path | str, header: list[str], chosen: str, said: list[str
             raise ConfigError(path, "", f"the header says {strange!r}: {what} in another unit", allowed)
     if chosen == "auto":
         said.append(f"speeds in {named or 'rad/s'}" + (", as the header says" if named else ": guessed"))
-        return named or "rad/s", []
+        return named or _GUESSED, []
     doubt = f"speeds in {chosen}, as --speed-unit says, although the header says {named}"
     return chosen, [] if named in ("", chosen) else [doubt]
 

@@ -150,6 +150,8 @@ def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys)
         ("km/h,Nm,eta\n1,2,0.4\n", (), "'km/h': speeds in another unit; allowed: rad/s or rpm: --speed-unit"),
         ("1/s,Nm,eta\n1,2,0.4\n", (), "'1/s': speeds in another unit"),
         ("krpm,Nm,eta\n1,2,0.4\n", (), "'krpm': speeds in another unit"),
+        ("speed_%,Nm,eta\n1,2,0.4\n", (), "'speed_%': speeds in another unit"),
+        ("rpm,Torque [%],eta\n1,2,0.4\n", (), "'Torque [%]': torques in another unit"),
         ("rpm;Nm;eta\n955;2,5;0,4\n1.194;2,5;0,4\n", (), "'1.194' has a point, in a table of decimal commas"),
         ("T,1,2,3\n-5,0.1,0.2,0.3\n", (), "speed -5 is out of range (taken for a matrix"),
         ("T,1,2,3\n-5,0.1,0.2,0.3\n", (), "allowed: >= 0, or --down torque; for a list three columns: speed,"),
@@ -239,10 +241,19 @@ def test_speeds_taken_for_torques_are_warned_of(tmp_path, capsys):
     code, _, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "map.csv")
     assert code == 0
     assert "torques up to 9000 N m at the motor: --down?" in err
-    (tmp_path / "sheet.csv").write_text("Nm" + sheet)
+    (tmp_path / "sheet.csv").write_text("Nm\\rpm" + sheet)
     code, out, err = run(capsys, tmp_path / "sheet.csv", "--output", tmp_path / "again.csv")
     assert (code, err) == (0, "")
-    assert "torques down: the corner says 'Nm'" in out
+    assert "torques down: the corner says 'Nm\\rpm'" in out
+
+
+def test_speeds_of_no_unit_that_are_high_for_rad_s_are_warned_of(tmp_path, capsys):
+    sheet = "speed,torque,efficiency\n" + "".join(f"{s},{t},0.8{t}\n" for s in (0, 100, {}) for t in (1, 5))
+    for fastest, options, warned in ((3000, (), True), (300, (), False), (3000, ("--speed-unit", "rad/s"), False)):
+        (tmp_path / "sheet.csv").write_text(sheet.replace("{}", str(fastest)))
+        code, _, err = run(capsys, tmp_path / "sheet.csv", *options, "--output", tmp_path / "map.csv")
+        assert code == 0
+        assert ("speeds up to 3000 of no unit are taken for rad/s: rpm? --speed-unit says it" in err) is warned
 
 
 def test_a_unit_that_contradicts_the_header_is_warned_of(tmp_path, capsys):
