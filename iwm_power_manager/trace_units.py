@@ -48,6 +48,8 @@ _NEAR = 0.05
 #: A demand explains the car's motion where so many seconds correlate so much; so many times more energy than was asked
 #: for is no other car's mass and no slope.
 _LEAST_SECONDS, _EXPLAINS, _TIMES_DEMAND = 10, 0.7, 5.0
+#: A demand that differs from its mean by no more than this part is one that does not change, and this little is none.
+_STEADY, _LITTLE_J = 0.02, 1000.0
 #: So many times more it is where kilowatts were taken for watts, whatever the road load and the mass that was meant.
 _KILO = (300.0, 3000.0)
 
@@ -191,6 +193,9 @@ class Energies:
         if len(self._demanded_j) < _LEAST_SECONDS:
             return ""
         (demand, both), (_, gain) = np.cov(self._demanded_j, self._gained_j)
+        usual, most = float(np.mean(self._demanded_j)), max(self._gained_j)
+        if demand <= (_STEADY * usual) ** 2 and most > _TIMES_DEMAND * max(usual, _LITTLE_J):
+            return "power_demand does not change, and yet the car speeds up: is it another signal?"
         if not demand or not gain or both**2 < _EXPLAINS**2 * demand * gain:
             return ""
         if both < 0.0:

@@ -28,6 +28,12 @@ def test_a_demand_in_kilowatts_is_said_however_often_it_comes(step_s):
     assert not said(lambda kinetic_w: kinetic_w, step_s)
 
 
+@pytest.mark.parametrize("demand_w", [0.0, 1000.0, -5000.0])
+def test_a_demand_that_stands_while_the_car_speeds_up_is_said(demand_w):
+    assert said(lambda _: demand_w, 0.1).startswith("power_demand does not change, and yet the car speeds up")
+    assert not said(lambda _: 20_000.0, 0.1)  # that may be what moves a heavier car
+
+
 def test_of_a_demand_that_has_nothing_to_do_with_the_motion_nothing_is_said():
     for seed in range(20):
         random = np.random.default_rng(seed)

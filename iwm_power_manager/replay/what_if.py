@@ -135,6 +135,7 @@ def what_if(
     if rows[0].distance_m < _LEAST_DISTANCE_M or rows[0].chemical_wh == 0.0:
         raise NoAnswerError(
             f"{bag.path}: the car does not move ({rows[0].distance_m:.2f} m): there is nothing to compare"
+            + "".join(f"; {note}" for note in report.notes)
         )
     return rows, report
 

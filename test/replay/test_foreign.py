@@ -16,7 +16,7 @@ import foreign_bags as foreign
 from bags_helpers import joint_state_writer
 from foreign_bags import CHANNELS, COUNT, DEMAND, JOINTS, LINE, SPEED, drive, write_bag, write_mcap, write_sqlite
 from iwm_power_manager.bags.reader import BagReader
-from iwm_power_manager.errors import BagError
+from iwm_power_manager.errors import BagError, NoAnswerError
 from iwm_power_manager.exit_codes import BAD_INPUT, CANNOT_TELL, DONE
 from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.recorded import read_drives, read_signal
@@ -247,7 +247,7 @@ def test_a_speed_against_the_wheels_is_said(tmp_path: Path, mapping: Path) -> No
         (0.1, "energy that power_demand asks for: another unit, or another car?"),
         (1.0, ""),
         (0.5, ""),
-        (0.0, ""),
+        (0.0, "power_demand does not change, and yet the car speeds up: is it another signal?"),
     ],
 )
 def test_a_demand_that_cannot_have_moved_the_car_is_said(
@@ -517,6 +517,15 @@ def test_far_fewer_steps_than_messages_are_said(tmp_path: Path, mapping: Path) -
     report, _ = replayed(write_bag(tmp_path / "bag", entries), mapping)
     assert report.steps == 5
     assert any(note.startswith(f"only 5 steps of {COUNT} messages") for note in report.notes)
+
+
+def test_why_nothing_moves_is_said(tmp_path: Path, mapping: Path) -> None:
+    backwards = drive(velocity=lambda i, w: (w if i < 3 else -w,) * 4)
+    plan = make_plan(Choice(strategy="equal", mapping=str(mapping)), {})
+    with BagReader(write_bag(tmp_path / "bag", backwards)) as reader, pytest.raises(NoAnswerError) as caught:
+        what_if(reader, [("equal", plan)])
+    assert "does not move" in str(caught.value)
+    assert "wheel front_left not believed: 97 opposite" in str(caught.value)
 
 
 def test_a_car_that_stands_gives_no_zero_for_an_answer(
