@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import sys
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NoReturn
 
@@ -15,6 +17,10 @@ from iwm_power_manager.exit_codes import BAD_INPUT
 
 #: What argparse says of a value that is none of the choices.
 _CHOICE = re.compile(r"invalid choice: '(?P<given>[^']*)' \(choose from (?P<known>.*)\)$")
+
+
+class Written(str):
+    """Name of a file that a command writes, - for standard output: none that it reads, and no other one's."""
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -43,8 +49,22 @@ class CommandParser(argparse.ArgumentParser):
             near = [name for word in unknown for name in spelled_like(word.partition("=")[0], options)[:1]]
             self.error(f"unrecognized arguments: {' '.join(unknown)}{did_you_mean(near)}")
         names = (word.partition("=")[0] for word in words if word.startswith("--"))
+        self._check_written(vars(found))
         found.given = {positive if (positive := f"--{name[5:]}") in options else name for name in names}
         return found, unknown
+
+    def _check_written(self, values: Mapping[str, Any]) -> None:
+        shown = {action.dest: (action.option_strings or [action.dest])[0] for action in self._actions}
+        named = [
+            (shown.get(name, name), value, os.path.realpath(value))
+            for name, given in values.items()
+            for value in (given if isinstance(given, list) else [given])
+            if isinstance(value, Written) or (isinstance(value, str | Path) and os.path.exists(value))
+        ]
+        for name, value, path in named:
+            other = next((other for other, again, there in named if there == path and again is not value), "")
+            if isinstance(value, Written) and value not in ("", "-") and other:
+                self.error(f"argument {name}: {value} would be written over what {other} names")
 
     def check(self, options: argparse.Namespace, useful: Mapping[str, tuple[object, str]]) -> None:
         """`refuse_without_effect`, as a mistake in the command line."""

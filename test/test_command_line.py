@@ -7,7 +7,7 @@ import pytest
 
 from iwm_power_manager.command_line import CommandParser, refuse_without_effect
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.tools.command import picture
+from iwm_power_manager.tools.command import output_file, picture
 
 
 @pytest.fixture
@@ -47,6 +47,41 @@ def test_a_mistake_is_one_line_that_says_where_help_is(parser, arguments, words,
     assert words in line
     assert line.startswith(f"{program}: error: ")
     assert line.endswith(f"(see {program} --help)")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (
+            ["--cycle", "a.svg", "b.csv", "--plot", "./b.svg", "--json", "b.csv"],
+            "--json: b.csv would be written over what --cycle",
+        ),
+        (["--plot", "a.svg", "--json", "{here}/a.svg"], "--plot: a.svg would be written over what --json names"),
+        (["b.csv", "--json", "b.csv"], "--json: b.csv would be written over what log names"),
+        (["--json", "."], "--json: . cannot be written: it is a folder"),
+        (["--cycle", "-", "--json", "-"], ""),
+        (["equal", "--json", "equal"], ""),  # a word, and no file
+        (["--cycle", "a.csv", "a.csv", "--json", "b.csv"], ""),
+    ],
+)
+def test_nothing_is_written_over_what_is_read_or_written_by_another_option(
+    arguments, words, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "b.csv").touch()
+    made = CommandParser("draw")
+    made.add_argument("log", nargs="?")
+    made.add_argument("--cycle", nargs="+")
+    made.add_argument("--plot", type=picture)
+    made.add_argument("--json", type=output_file)
+    arguments = [word.replace("{here}", str(tmp_path)) for word in arguments]
+    if words:
+        with pytest.raises(SystemExit) as stop:
+            made.parse_args(arguments)
+        assert stop.value.code == 2
+        assert words in capsys.readouterr().err
+    else:
+        made.parse_args(arguments)
 
 
 def test_help_stands_as_typed(parser, capsys):

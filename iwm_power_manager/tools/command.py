@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iwm_power_manager import __version__
-from iwm_power_manager.command_line import CommandParser
+from iwm_power_manager.command_line import CommandParser, Written
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.exit_codes import DONE, INTERRUPTED
 from iwm_power_manager.files import atomic_write, no_empty_remains
@@ -122,18 +122,20 @@ def write_json(path: Path | str, value: Any) -> None:
 PICTURES = {".pdf": {"CreationDate": None}, ".png": {"Software": None}, ".svg": {"Date": None}}
 
 
-def output_file(text: str) -> str:
-    """Argument type of a file's name to write to; one in no folder is refused before anything is computed for it."""
+def output_file(text: str) -> Written:
+    """Argument type of a file's name to write to; what cannot be one is refused before anything is computed for it."""
     if text != "-" and not Path(text).absolute().parent.is_dir():
         raise argparse.ArgumentTypeError(f"{text} cannot be written: no such folder")
-    return text
+    if os.path.isdir(text):
+        raise argparse.ArgumentTypeError(f"{text} cannot be written: it is a folder")
+    return Written(text)
 
 
-def picture(text: str) -> Path:
+def picture(text: str) -> Written:
     """Argument type of a picture's file name."""
     if Path(output_file(text)).suffix.lower() not in PICTURES:
         raise argparse.ArgumentTypeError(f"{text} is no picture's name; allowed: ending in {', '.join(PICTURES)}")
-    return Path(text)
+    return Written(text)
 
 
 def write_picture(path: Path | str, figure: Any, dpi: int = 150) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from iwm_power_manager import __version__
-from iwm_power_manager.command_line import refuse_without_effect
+from iwm_power_manager.command_line import Written, refuse_without_effect
 from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.files import check_number
@@ -119,11 +119,16 @@ def parser() -> argparse.ArgumentParser:
     )
 
     output = result.add_argument_group("output")
-    output.add_argument("--output", metavar="DIR|FILE", help="folder for the policies, or a .npz file for a single one")
+    output.add_argument(
+        "--output", type=Written, metavar="DIR|FILE", help="folder for the policies, or a .npz file for a single one"
+    )
     output.add_argument("--plot", type=picture, metavar="PICTURE", help="demand, convergence, policy: .pdf, .png, .svg")
     output.add_argument("--json", type=output_file, metavar="FILE", help="the run's numbers; - for standard output")
     output.add_argument(
-        "--export-mdp", metavar="NPZ", help="the exact problem, for another solver (one friction; docs/solver.md)"
+        "--export-mdp",
+        type=Written,
+        metavar="NPZ",
+        help="the exact problem, for another solver (one friction; docs/solver.md)",
     )
     output.add_argument(
         "--verify",

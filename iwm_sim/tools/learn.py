@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from iwm_power_manager import __version__
-from iwm_power_manager.command_line import refuse_without_effect
+from iwm_power_manager.command_line import Written, refuse_without_effect
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.cycle import load_cycle
 from iwm_power_manager.errors import ConfigError
@@ -82,7 +82,9 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument("--vehicle", required=True, metavar="FILE", help="car, YAML (config/vehicles/)")
     result.add_argument("--bag", **several, required=True, metavar="BAG", help="recorded drives")
     result.add_argument("--friction", nargs="+", type=float, required=True, metavar="MU", help="one policy each")
-    result.add_argument("--output", required=True, metavar="DIR|FILE", help="folder, or a .npz file for a single one")
+    result.add_argument(
+        "--output", type=Written, required=True, metavar="DIR|FILE", help="folder, or a .npz file for a single one"
+    )
     result.add_argument("--mapping", metavar="YAML", help="topics and units of foreign bags (config/signals/)")
     result.add_argument(
         "--cycle", **several, metavar="CSV", help=f"cycles beside the bags (default: {', '.join(CYCLES)})"
