@@ -159,7 +159,7 @@ def load_cycle(path: Path | str) -> Cycle:
         grade=columns["grade"],
         sha256=sha256_of(path),
         path=str(path),
-        gap=_gap(path, places, columns["time_s"], columns["speed_mps"]),
+        gap=_gap(path, places, columns),
     )
 
 
@@ -214,20 +214,27 @@ def _check_duration(path: Path | str, places: list[str], time_s: NDArray[np.floa
         raise ConfigError(path, places[late[0]], problem, "a drive in seconds")
 
 
-def _gap(path: Path | str, places: list[str], time_s: NDArray[np.float64], speed_mps: NDArray[np.float64]) -> str:
-    """The longest step in which a car moves and that is no step of this trace, in words; "" if there is none."""
+def longest_gap(time_s: NDArray[np.float64], speed_mps: NDArray[np.float64]) -> tuple[int, str] | None:
+    """The longest step in which a car moves and that is no step of this trace: the point behind it, and words."""
     steps = np.diff(time_s)
     usual_s = float(np.median(steps))
     moves = (speed_mps[1:] > 0.0) | (speed_mps[:-1] > 0.0)
     found = np.flatnonzero(moves & (steps > _GAP_S) & (steps >= _GAP_STEPS * usual_s))
     if not found.size:
-        return ""
+        return None
     at = int(found[np.argmax(steps[found])])
     others = f", and {found.size - 1} more such" if found.size > 1 else ""
-    return (
-        f"{path}: {places[at + 1]}: is {steps[at]:.4g} s after the one before{others}, where {usual_s:.3g} s is usual: "
-        "taken for a straight line; if nobody recorded it, import_cycle --gaps cut leaves it out"
-    )
+    words = f"is {steps[at]:.4g} s after the one before{others}, where {usual_s:.3g} s is usual"
+    return at + 1, words
+
+
+def _gap(path: Path | str, places: list[str], columns: dict[str, NDArray[np.float64]]) -> str:
+    found = longest_gap(columns["time_s"], columns["speed_mps"])
+    if found is None:
+        return ""
+    at, words = found
+    advice = "if nobody recorded it, import_cycle --gaps cut leaves it out"
+    return f"{path}: {places[at]}: {words}: taken for a straight line; {advice}"
 
 
 def _unit_hint(columns: dict[str, NDArray[np.float64]]) -> str:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from iwm_power_manager.control.budget import price_units
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import PolicyTable, empty_table
-from iwm_power_manager.cycle import Cycle, make_cycle
+from iwm_power_manager.cycle import Cycle, longest_gap, make_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.mdp.demand import Source, chain_of
 from iwm_power_manager.mdp.problem import Problem
@@ -123,7 +123,13 @@ def recorded_cycle(name: str, drive: RecordedDrive) -> Cycle:
     integral = np.concatenate([[0.0], np.cumsum(np.diff(since) * 0.5 * (speed[1:] + speed[:-1]))])
     first, last = np.maximum(time - 0.5 * _TRACE_STEP_S, 0.0), np.minimum(time + 0.5 * _TRACE_STEP_S, since[-1])
     mean = (np.interp(last, since, integral) - np.interp(first, since, integral)) / (last - first)
-    return make_cycle(name, time, mean)
+    gap = longest_gap(since, speed)
+    words = (
+        f"{name}: the speed at {since[gap[0]]:.6g} s {gap[1]}: policies are tried on a straight line there"
+        if gap
+        else ""
+    )
+    return dataclasses.replace(make_cycle(name, time, mean), gap=words)
 
 
 def sources_at(weight: float, recorded: Sequence[Source], general: Sequence[Source]) -> list[Source]:

@@ -146,7 +146,8 @@ def _learn(options: argparse.Namespace) -> None:
         else [recorded_cycle(name, drive) for name, drive in recordings]
     )
     given = [load_cycle(resolve(name)) for name in dict.fromkeys([*(options.cycle or ()), *(options.drive or ())])]
-    for line in doubts(vehicle, given, frictions):
+    missed = [f"warning: {drive.gap}" for drive in ([] if options.drive else drives) if drive.gap]
+    for line in (*doubts(vehicle, given, frictions), *missed):
         print(f"learn_policy: {line}", file=sys.stderr)
     note_replaced(*paths)
     candidates = candidates_of(problem, options.weights, options.bandwidths)

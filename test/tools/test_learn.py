@@ -85,6 +85,12 @@ class TestRecordedCycle:
         cycle = recorded_cycle("drive", RecordedDrive(time_s, time_s, np.full(51, -0.3), 0, ()))
         assert cycle.speed_mps.tolist() == [0.0] * 6
 
+    def test_what_nobody_recorded_is_known(self) -> None:
+        time_s = np.concatenate([np.arange(0.0, 5.0, 0.1), np.arange(65.0, 70.0, 0.1)])
+        gap = recorded_cycle("drive", RecordedDrive(time_s, time_s, np.full(100, 8.0), 0, ())).gap
+        assert gap.startswith("drive: the speed at 65 s is 60.1 s after the one before, where 0.1 s is usual: policies")
+        assert recorded_cycle("drive", RecordedDrive(time_s, time_s, np.zeros(100), 0, ())).gap == ""
+
     def test_too_short(self) -> None:
         time_s = np.array([0.0, 1.9])
         with pytest.raises(ConfigError, match=r"drive.*too short"):
@@ -229,6 +235,21 @@ class TestCommand:
         assert text.count("<- chosen") == 2 and text.count("nothing: cycles alone") == 2
         files = sorted((tmp_path / "out").iterdir())
         assert [load_policy(file).friction for file in files] == [0.5, 0.9]
+
+    def test_what_nobody_recorded_or_drove_is_said(self, nycc_bag: Path, tmp_path: Path, monkeypatch, capsys) -> None:
+        def gone(*_: object) -> None:
+            raise ConfigError("so far", "", "and no further")
+
+        driven = dataclasses.replace(load_cycle(share_path("config/cycles/nycc.csv")), gap="a tunnel")
+        monkeypatch.setattr(learn, "recorded_cycle", lambda *_: driven)
+        monkeypatch.setattr(learn, "candidates_of", gone)
+        other = tmp_path / "tunnel.csv"
+        other.write_text("time_s,speed_mps\n0,9\n1,10\n2,10\n62,10\n63,9\n64,9\n")
+        given = ["--vehicle", CAR, "--bag", str(nycc_bag), "--friction", "0.9", "--output", str(tmp_path / "p.npz")]
+        assert learn.main([*given, "--cycle", str(other)]) == BAD_INPUT
+        said = capsys.readouterr().err
+        assert f"learn_policy: warning: {other}: line 5: is 60 s after the one before" in said
+        assert "learn_policy: warning: a tunnel\n" in said
 
     @pytest.mark.parametrize(
         ("arguments", "said"),
