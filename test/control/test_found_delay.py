@@ -85,6 +85,13 @@ def test_one_that_is_told_too_long_is_found_to_be_shorter(seed):
     assert Wheels(jumping(seed), 2).found_ms(told_ms=12)[-1] == -10
 
 
+def test_through_much_noise_a_shorter_delay_is_taken_and_a_longer_one_is_not():
+    """2 ms too short are borne, and too long by 3 they are not: so the one asks for less evidence than the other."""
+    for seed in range(10):
+        assert Wheels(jumping(seed), 8, noise=0.3).found_ms(told_ms=10)[-1] < 0
+        assert Wheels(jumping(seed), 10, noise=0.3).found_ms(told_ms=8)[-1] == 0
+
+
 @given(st.integers(0, 99), st.floats(0.0, 0.2), st.integers(0, 20))
 def test_what_is_told_right_stays(seed, noise, true_ms):
     assert not any(Wheels(jumping(seed), true_ms, noise=noise).found_ms(told_ms=true_ms))
