@@ -32,7 +32,7 @@ SENSOR_KINDS = {
     "stuck": None,
     "missing": None,
 }
-ACTUATOR_KINDS = {"factor": _ANY, "torque_nm": _ANY, "dead": None, "reversed": None}
+ACTUATOR_KINDS = {"factor": _ANY, "torque_nm": _ANY, "lag_s": (0.001, 10.0, "s"), "dead": None, "reversed": None}
 MESSAGE_KINDS = {
     "lost": None,
     "delay_s": (0.0, 10.0, "s"),
@@ -100,6 +100,7 @@ class Faults:
         self._dt_s = dt_s
         self._stuck: dict[Fault, float] = {}
         self._turned: dict[Fault, _Turned] = {}
+        self._reached: dict[Fault, float] = {}
         self._ways = {f.target: _Way(f.target) for f in self._faults if f.message}
 
     def arriving(self, message: str, shown: _Shown, time_s: float, now_ns: int) -> Iterable[tuple[int, _Shown]]:
@@ -202,9 +203,18 @@ class Faults:
                 torques[i] *= fault.value
             elif fault.kind == "torque_nm":
                 torques[i] = fault.value
+            elif fault.kind == "lag_s":
+                torques[i] = self._lagging(fault, torques[i])
             elif fault.kind == "dead":
                 torques[i] = 0.0
             else:
                 torques[i] = -torques[i]
         a, b, c, d = torques
         return a, b, c, d
+
+    def _lagging(self, fault: Fault, torque_nm: float) -> float:
+        """Mean over a step of a torque that follows as a lag of first order, at the end of which it is remembered."""
+        missing = self._reached.get(fault, 0.0) - torque_nm
+        left = math.exp(-self._dt_s / fault.value)
+        self._reached[fault] = torque_nm + left * missing
+        return torque_nm + (1.0 - left) * fault.value / self._dt_s * missing

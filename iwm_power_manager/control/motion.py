@@ -49,6 +49,7 @@ from iwm_power_manager.control.types import FourWheels, Measurement, MotionState
 from iwm_power_manager.control.wheel_doubt import (
     SLOW_MPS,
     WORN_PART,
+    acting_nm,
     clamped,
     combined_factor,
     common_jump,
@@ -138,6 +139,14 @@ def _bias_mps2(before: float, shown: float, predicted: float, trusted: bool, rol
 
 
 @kernel
+def _acceleration_mps2(forces: float, before: MotionState, first: bool, vehicle: VehicleParams) -> float:
+    """What changes the speed of a car that moves: the road's forces, its resistance, and what they do not explain."""
+    if abs(before.speed_mps) > SLOW_MPS and not first:
+        return forces - road_resistance_mps2(before.speed_mps, vehicle) + before.bias_mps2
+    return 0.0
+
+
+@kernel
 def estimate(
     measurement: Measurement,
     before: MotionState,
@@ -156,8 +165,7 @@ def estimate(
     travel : 1 if that was forwards, -1 backwards
     first : the first step of a run: nothing is known from before
     """
-    shown = measurement.speed_mps
-    dt = measurement.dt_s
+    shown, dt = measurement.speed_mps, measurement.dt_s
     raw, shift = measurement.wheel_speed_radps, measurement.torque_shift_nm
     if first:
         before = started_motion(shown, rims_of(raw, vehicle))
@@ -169,10 +177,9 @@ def estimate(
     w = scaled_wheels(factor, raw)
     rims = rims_of(w, vehicle)
     turning = turning_of(w, wheels, travel, first, dt, before.wheel_doubt_s, vehicle)
+    least, most = acting_nm(turning.torque_nm, before, dt)
     forces = force_mps2(turning.road_nm, vehicle)
-    acceleration = 0.0
-    if abs(before.speed_mps) > SLOW_MPS and not first:
-        acceleration = forces - road_resistance_mps2(before.speed_mps, vehicle) + before.bias_mps2
+    acceleration = _acceleration_mps2(forces, before, first, vehicle)
     predicted = before.speed_mps + acceleration * dt
     agreed, mean, right = vote(shown, rims, predicted, acceleration, measurement, turning, before, vehicle)
     if right:
@@ -180,7 +187,7 @@ def estimate(
         before = restarted_motion(mean, rims, agreed, shown, wheels, turning, before, vehicle)
         agreed = before.agreed
     stray, doubt = wheel_doubts(
-        w, turning, shift, predicted, acceleration, dt, before.wheel_stray_s, before.wheel_doubt_s, vehicle
+        w, turning, shift, least, most, predicted, acceleration, dt, before.wheel_stray_s, before.wheel_doubt_s, vehicle
     )
     rolling = rolling_of(rims, doubt, turning)
     sensor = judged_speed(shown, predicted, acceleration, dt, before, rolling)
@@ -211,6 +218,8 @@ def estimate(
         doubt_s=sensor.doubt_s,
         wheel_stray_s=stray,
         wheel_doubt_s=doubt,
+        least_nm=least,
+        most_nm=most,
         agreed=agreed,
         brake_gain=before.brake_gain,
         wheels_factor=told,

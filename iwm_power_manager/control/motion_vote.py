@@ -87,6 +87,8 @@ def fresh_motion(
         doubt_s=0.0,
         wheel_stray_s=NO_WHEELS,
         wheel_doubt_s=(wheel_doubt_s, wheel_doubt_s, wheel_doubt_s, wheel_doubt_s),
+        least_nm=NO_WHEELS,
+        most_nm=NO_WHEELS,
         agreed=Agreed(0.0, 0.0, 0.0, 0.0),
         brake_gain=brake_gain,
         wheels_factor=factor,

@@ -217,6 +217,7 @@ class MotionState(NamedTuple):
     doubt_s : time the speed sensor has yet to be good; 0 is believed
     wheel_stray_s : how long each wheel has stayed away although nothing holds it
     wheel_doubt_s : time each wheel has yet to be good
+    least_nm, most_nm : torques that may act on each wheel, however motors and brakes lag, forwards positive
     agreed : speeds that outvote the forces
     brake_gain : part of a friction torque that each brake gives, as found
     wheels_factor : what all four wheel speeds are multiplied by, since they are wrong by its inverse
@@ -233,6 +234,8 @@ class MotionState(NamedTuple):
     doubt_s: float
     wheel_stray_s: Wheels
     wheel_doubt_s: Wheels
+    least_nm: Wheels
+    most_nm: Wheels
     agreed: Agreed
     brake_gain: Wheels
     wheels_factor: float
@@ -352,6 +355,8 @@ def initial_state() -> ControllerState:
             doubt_s=0.0,
             wheel_stray_s=none,
             wheel_doubt_s=none,
+            least_nm=none,
+            most_nm=none,
             agreed=Agreed(lasted_s=0.0, from_mps=0.0, moved_mps=0.0, felt_mps=0.0),
             brake_gain=(1.0, 1.0, 1.0, 1.0),
             wheels_factor=1.0,

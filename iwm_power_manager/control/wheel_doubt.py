@@ -20,6 +20,10 @@ DISTRUST_S = 0.5
 #: Noise of a wheel's change in one step, rad/s; what a torque explains is taken times `TORQUE_MARGIN`.
 JUMP_RADPS = 1.5
 TORQUE_MARGIN = 1.5
+#: Motors and brakes may follow their command as a lag of first order that nobody tells, up to this time constant: then
+#: what acts is between the least and the most that was commanded, fading so. A wheel that turns away from the car's
+#: speed by so many rad/s more in a step than the car's own change is moved by a torque that acts still.
+LAG_S, MOVED_RADPS = 0.06, 0.5
 #: A wheel without torque (part of load times radius) and away from the car's speed comes back at least as fast as on
 #: the smoothest ice; one that does not for this long is a bad sensor. It is good again within the second pair. A gated
 #: wheel is away beyond the third, one that runs against its torque beyond the fourth, which bends stay within.
@@ -127,11 +131,39 @@ def turning_of(
 
 
 @kernel
+def _fading_nm(torque_nm: float, before_nm: float, dt_s: float) -> float:
+    """What may be left of a torque of before."""
+    return torque_nm + LAG_S / (LAG_S + dt_s) * (before_nm - torque_nm)
+
+
+@kernel
+def acting_nm(torque_nm: Wheels, before: MotionState, dt_s: float) -> tuple[Wheels, Wheels]:
+    """The least and the most torque that may have acted on each wheel, signed as the car is."""
+    a, b, c, d = torque_nm
+    low, high = before.least_nm, before.most_nm
+    least = (
+        min(a, _fading_nm(a, low[0], dt_s)),
+        min(b, _fading_nm(b, low[1], dt_s)),
+        min(c, _fading_nm(c, low[2], dt_s)),
+        min(d, _fading_nm(d, low[3], dt_s)),
+    )
+    most = (
+        max(a, _fading_nm(a, high[0], dt_s)),
+        max(b, _fading_nm(b, high[1], dt_s)),
+        max(c, _fading_nm(c, high[2], dt_s)),
+        max(d, _fading_nm(d, high[3], dt_s)),
+    )
+    return least, most
+
+
+@kernel
 def _wheel_doubt(
     speed_radps: float,
     change_radps: float,
     torque_nm: float,
     shift_nm: float,
+    least_nm: float,
+    most_nm: float,
     reference_mps: float,
     acceleration_mps2: float,
     dt_s: float,
@@ -147,17 +179,17 @@ def _wheel_doubt(
     direction = 1.0 if reference_mps >= 0.0 else -1.0
     level = direction * (radius * speed_radps - reference_mps)
     change = direction * change_radps
-    explained = direction * torque_nm / inertia * dt_s
-    # Where a stamp looks older than it is, the last torque explains more than the one that was looked up by it.
-    last = direction * (torque_nm - shift_nm) / inertia * dt_s
     rolling = direction * acceleration_mps2 / radius * dt_s
-    jumped = False
-    if size > SLOW_MPS:
-        # The road only ever drives a wheel towards the car's speed.
-        if level < 0.0:
-            jumped = change < TORQUE_MARGIN * min(explained, last, rolling, 0.0) - JUMP_RADPS
-        else:
-            jumped = change > TORQUE_MARGIN * max(explained, last, rolling, 0.0) + JUMP_RADPS
+    # Away from the car's speed: what the wheel did, what the car does, and the torques that may have acted.
+    sign = -1.0 if level < 0.0 else 1.0
+    away_radps, away_rolling = sign * change, max(sign * rolling, 0.0)
+    away_nm = max(sign * direction * least_nm, sign * direction * most_nm)
+    # Where a stamp looks older than it is, the last torque explains more than the one that was looked up by it.
+    looked_up, last = sign * direction * torque_nm, sign * direction * (torque_nm - shift_nm)
+    explained = TORQUE_MARGIN * max(max(looked_up, last, 0.0) / inertia * dt_s, away_rolling)
+    # The road only ever drives a wheel towards the car's speed.
+    jumped = size > SLOW_MPS and away_radps > max(explained, away_nm / inertia * dt_s) + JUMP_RADPS
+    moved = away_nm > FREE_PART * load_nm and away_radps > TORQUE_MARGIN * away_rolling + MOVED_RADPS
     # Nothing holds a wheel that is free, nor one that is braked and yet faster than the car.
     free = abs(torque_nm) < FREE_PART * load_nm
     against = direction * torque_nm * level < 0.0 and not free
@@ -167,10 +199,10 @@ def _wheel_doubt(
         away = abs(level) > HELD_PART * size + HELD_MPS
     elif against:
         away = abs(level) > AGAINST_PART * size + AGAINST_MPS
-    if (free or against) and away and (-change if level > 0.0 else change) < ICE_FRICTION * load_nm / inertia * dt_s:
-        stray_s = min(stray_s + dt_s, 2.0 * RETURN_S)  # no matter for how long it was wrong
-    else:
-        stray_s = max(stray_s - dt_s, 0.0)
+    held = moved or -away_radps >= ICE_FRICTION * load_nm / inertia * dt_s
+    stays = (free or against) and away and not held
+    # Beyond the first it is no matter for how long it was wrong.
+    stray_s = min(stray_s + dt_s, 2.0 * RETURN_S) if stays else max(stray_s - dt_s, 0.0)
     # A step that jumps away is a fault; one that jumps back is the end of it.
     if (jumped and away) or stray_s > RETURN_S:
         doubt_s = DISTRUST_S
@@ -184,6 +216,8 @@ def wheel_doubts(
     w: Wheels,
     t: Turning,
     shift_nm: Wheels,
+    least_nm: Wheels,
+    most_nm: Wheels,
     predicted: float,
     acceleration: float,
     dt: float,
@@ -192,19 +226,19 @@ def wheel_doubts(
     vehicle: VehicleParams,
 ) -> tuple[Wheels, Wheels]:
     """How long each wheel has stayed away by now, and the time it has yet to be good."""
-    front, rear = vehicle.front.wheel, vehicle.rear.wheel
-    torque, change, g, shift = t.torque_nm, t.change_radps, t.gated, shift_nm
+    torque, change, g, shift, low, high = t.torque_nm, t.change_radps, t.gated, shift_nm, least_nm, most_nm
+    front, rear, f, r, v, a = vehicle.front.wheel, vehicle.rear.wheel, t.front_nm, t.rear_nm, predicted, acceleration
     s0, d0 = _wheel_doubt(
-        w[0], change[0], torque[0], shift[0], predicted, acceleration, dt, stray[0], old[0], g[0], front, t.front_nm
+        w[0], change[0], torque[0], shift[0], low[0], high[0], v, a, dt, stray[0], old[0], g[0], front, f
     )
     s1, d1 = _wheel_doubt(
-        w[1], change[1], torque[1], shift[1], predicted, acceleration, dt, stray[1], old[1], g[1], front, t.front_nm
+        w[1], change[1], torque[1], shift[1], low[1], high[1], v, a, dt, stray[1], old[1], g[1], front, f
     )
     s2, d2 = _wheel_doubt(
-        w[2], change[2], torque[2], shift[2], predicted, acceleration, dt, stray[2], old[2], g[2], rear, t.rear_nm
+        w[2], change[2], torque[2], shift[2], low[2], high[2], v, a, dt, stray[2], old[2], g[2], rear, r
     )
     s3, d3 = _wheel_doubt(
-        w[3], change[3], torque[3], shift[3], predicted, acceleration, dt, stray[3], old[3], g[3], rear, t.rear_nm
+        w[3], change[3], torque[3], shift[3], low[3], high[3], v, a, dt, stray[3], old[3], g[3], rear, r
     )
     return (s0, s1, s2, s3), (d0, d1, d2, d3)
 

@@ -285,6 +285,8 @@ class Scene:
             doubt_s=d.of(0.0, d.between(0.0, 0.5)) if self.doubt_s is None else self.doubt_s,
             wheel_stray_s=d.of(none, d.four(lambda: d.between(0.0, 0.1))),
             wheel_doubt_s=none if self.doubts_s is None else self.doubts_s,
+            least_nm=d.of(none, d.four(lambda: d.between(-900.0, 0.0))),
+            most_nm=d.of(none, d.four(lambda: d.between(0.0, 200.0))),
             agreed=self.agreed,
             brake_gain=self.gains,
             wheels_factor=self.factor,

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+import random
 
 import pytest
 
@@ -11,16 +13,20 @@ from iwm_power_manager.control.types import initial_state
 from iwm_power_manager.control.wheel_doubt import (
     CALM_S,
     COMMON_RADPS,
+    FREE_PART,
     GOOD_MPS,
     GOOD_PART,
     HELD_MPS,
     HELD_PART,
     ICE_FRICTION,
     JUMP_RADPS,
+    LAG_S,
     LEAST_FACTOR,
+    MOVED_RADPS,
     RETURN_S,
     WORN_PART,
     Turning,
+    acting_nm,
     combined_factor,
     common_jump,
     middle_of,
@@ -43,16 +49,16 @@ def one(wheel, value, other):
     return tuple(value if i == wheel else other for i in range(4))
 
 
-def judged(
-    wheel, off_mps, change_radps=0.0, gated=False, stray_s=0.0, doubt_s=0.0, speed=20.0, torque_nm=0.0, last_nm=None
-):
+def judged(wheel, off_mps, change_radps=0.0, gated=False, stray_s=0.0, doubt_s=0.0, speed=20.0, **torques):
     """What is found of one wheel that is off while the others roll: time it has stayed away, time of its doubt."""
+    torque_nm = torques.get("torque_nm", 0.0)
+    last_nm, acted_nm = torques.get("last_nm", torque_nm), torques.get("acted_nm", 0.0)
     w = one(wheel, (speed + off_mps) / RADIUS, speed / RADIUS)
     change = one(wheel, change_radps, 0.0)
     turning = Turning(one(wheel, torque_nm, 0.0), change, NONE, one(wheel, gated, False), LOAD_NM, LOAD_NM)
-    shift = one(wheel, 0.0 if last_nm is None else torque_nm - last_nm, 0.0)
+    shift, least, most = (one(wheel, nm, 0.0) for nm in (torque_nm - last_nm, min(acted_nm, 0.0), max(acted_nm, 0.0)))
     stray, doubt = wheel_doubts(
-        w, turning, shift, speed, 0.0, DT, one(wheel, stray_s, 0.0), one(wheel, doubt_s, 0.0), CAR
+        w, turning, shift, least, most, speed, 0.0, DT, one(wheel, stray_s, 0.0), one(wheel, doubt_s, 0.0), CAR
     )
     assert [value for i, value in enumerate(stray + doubt) if i % 4 != wheel] == [0.0] * 6
     return stray[wheel], doubt[wheel]
@@ -84,6 +90,16 @@ def test_a_change_is_explained_by_the_last_torque_too_and_by_no_more(wheel, sign
 
 @WHEELS
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_change_is_explained_by_a_torque_that_may_act_still_without_a_margin(wheel, sign):
+    inertia = (CAR.front if wheel < 2 else CAR.rear).wheel.inertia_kgm2
+    most = 400.0 / inertia * DT + JUMP_RADPS
+    assert judged(wheel, sign * 3.0, sign * 0.98 * most, acted_nm=sign * 400.0)[1] == 0.0
+    assert judged(wheel, sign * 3.0, sign * 1.02 * most, acted_nm=sign * 400.0)[1] > 0.0
+    assert judged(wheel, sign * 3.0, sign * 0.98 * most, acted_nm=-sign * 400.0)[1] > 0.0
+
+
+@WHEELS
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_a_gated_wheel_is_away_beyond_its_own_bound_only(wheel, sign):
     bound = HELD_PART * 20.0 + HELD_MPS
     assert judged(wheel, sign * 0.95 * bound, gated=True)[0] == 0.0
@@ -110,6 +126,33 @@ def test_a_wheel_that_comes_back_slower_than_on_the_smoothest_ice_has_stayed_awa
     least = ICE_FRICTION * LOAD_NM / CAR.front.wheel.inertia_kgm2 * DT
     assert judged(wheel, sign * 8.0, -sign * 0.99 * least)[0] == DT
     assert judged(wheel, sign * 8.0, -sign * 1.01 * least)[0] == 0.0
+
+
+@WHEELS
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("gated", [False, True])
+def test_a_wheel_that_a_torque_of_before_still_moves_has_not_stayed_away(wheel, sign, gated):
+    little = 0.99 * FREE_PART * LOAD_NM
+    assert judged(wheel, sign * 8.0, sign * 1.01 * MOVED_RADPS, gated, acted_nm=sign * 200.0)[0] == 0.0
+    assert judged(wheel, sign * 8.0, sign * 0.99 * MOVED_RADPS, gated, acted_nm=sign * 200.0)[0] == DT
+    assert judged(wheel, sign * 8.0, sign * 1.01 * MOVED_RADPS, gated, acted_nm=sign * little)[0] == DT
+    assert judged(wheel, sign * 8.0, sign * 1.01 * MOVED_RADPS, gated, acted_nm=-sign * 200.0)[0] == DT
+
+
+@pytest.mark.parametrize("lag_s", [0.001, 0.01, 0.03, LAG_S])
+@pytest.mark.parametrize("travel", [-1.0, 1.0])
+def test_whatever_a_lag_makes_of_commands_is_between_the_torques_that_may_act(lag_s, travel):
+    draw = random.Random(7)
+    motion = initial_state().motion
+    acts = (0.0,) * 4
+    for _ in range(400):
+        commanded = tuple(travel * draw.choice([0.0, -900.0, 300.0, -50.0]) for _ in range(4))
+        kept = math.exp(-DT / lag_s)
+        acts = tuple(c + (a - c) * kept for c, a in zip(commanded, acts, strict=True))
+        least, most = acting_nm(commanded, motion, DT)
+        motion = motion._replace(least_nm=least, most_nm=most)
+        for i in range(4):
+            assert least[i] - 1e-9 <= acts[i] <= most[i] + 1e-9
 
 
 @WHEELS

@@ -60,6 +60,19 @@ def test_an_actuator_does_something_else_and_only_that_one(kind, value, torque):
     assert faults.brakes((30.0,) * 4, 6.0)[1] == torque
 
 
+@pytest.mark.parametrize("lag_s", [0.001, 0.02, 0.5])
+def test_an_actuator_that_lags_comes_nearer_by_its_time_constant_and_for_itself(lag_s):
+    faults = Faults([Fault("brake_rear_left", "lag_s", lag_s, 0.0, 9.0)], DT_S)
+    steps = range(1, 21)
+    acted = [faults.brakes((-300.0,) * 4, DT_S * k) for k in steps]
+    # Its integral: what a lag of first order has made of a step by then.
+    made = [DT_S * sum(nm[2] for nm in acted[:k]) for k in steps]
+    left = [1.0 - math.exp(-DT_S * k / lag_s) for k in steps]
+    assert made == pytest.approx([-300.0 * (DT_S * k - lag_s * part) for k, part in zip(steps, left, strict=True)])
+    assert {nm[:2] + nm[3:] for nm in acted} == {(-300.0,) * 3}
+    assert faults.motors(WHEELS, 0.3) == WHEELS
+
+
 def test_a_lost_message_leaves_the_sensor_of_the_same_name_alone():
     faults = Faults([Fault("vehicle_speed", "lost", 0.0, 1.0, 2.0, message=True)], DT_S)
     arrived = [list(faults.arriving("vehicle_speed", 7, t, 90)) for t in (0.5, 1.0, 1.9, 2.0)]
