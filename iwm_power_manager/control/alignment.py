@@ -146,14 +146,13 @@ class Alignment:
     def _mean_nm(self, from_ns: int, to_ns: int) -> Wheels:
         """Mean of the torques that acted between two times; the first that is remembered stands for those before."""
         a = b = c = d = 0.0
-        end, whole = to_ns, to_ns - from_ns
-        for k in range(len(self._torques) - 1, -1, -1):
+        k, end, whole = len(self._torques), to_ns, to_ns - from_ns
+        while end > from_ns:
+            k -= 1
             begin_ns, torque = self._torques[k]
             begin = max(begin_ns, from_ns) if k else from_ns
             if begin < end:
                 part = (end - begin) / whole
                 a, b, c, d = a + part * torque[0], b + part * torque[1], c + part * torque[2], d + part * torque[3]
                 end = begin
-            if end <= from_ns:
-                break
         return a, b, c, d

@@ -647,6 +647,21 @@ def test_the_torques_sum_to_the_demand_whenever_no_limit_and_no_gate_binds(speed
         assert total == pytest.approx(demand, abs=1e-3)
 
 
+def test_torques_that_act_20_ms_after_the_command_are_found_to_act_18_later_than_told(drive) -> None:
+    """The road takes the same from every wheel all the time, so that wheels turn as their torques say."""
+    drive.run(100, speed=25.0, demand=0.0)
+    assert drive.controller.torques_later_s == 0.0
+    speed, wheels = 25.0, [25.0 / RADIUS] * 4
+    inertia = [axle.wheel.inertia_kgm2 for axle in (VEHICLE.front, VEHICLE.front, VEHICLE.rear, VEHICLE.rear)]
+    for step in range(40):
+        acting = drive.commands[-3]
+        torques = [a + b for a, b in zip(acting.motor_torque_nm, acting.friction_torque_nm, strict=True)]
+        drive.run(1, speed=speed, wheels=wheels, demand=-60e3 if step * step % 7 in (1, 2) else 0.0)
+        wheels = [w + (t + 100.0) * DT / i for w, t, i in zip(wheels, torques, inertia, strict=True)]
+        speed -= 100.0 * 4.0 / RADIUS / VEHICLE.chassis.mass_kg * DT
+    assert drive.controller.torques_later_s == pytest.approx(0.018, abs=0.005)
+
+
 def test_the_speed_it_believes_is_the_sensors_until_that_contradicts_the_wheels(drive) -> None:
     assert drive.controller.believed_speed_mps == 0.0
     drive.run(100, speed=10.0, demand=0.0)

@@ -338,6 +338,12 @@ class TestDemand:
         assert not monitor.take_demand(2.0, 0.1001, NOW + MS)
         assert monitor.demand_w == 1.0
         assert monitor.tallies[DEMAND].violation is Violation.LATE
+        assert monitor.tallies[DEMAND].why() == "late: by 0.1 s; allowed: stamp_oldest_s 0.1"
+
+    def test_where_no_stamps_are_judged_a_late_demand_says_only_how_late_it_is(self) -> None:
+        monitor = InputMonitor(NAMES, LIMITS._replace(stamp=None))
+        assert not monitor.take_demand(2.0, 0.35, NOW)
+        assert monitor.tallies[DEMAND].why() == "late: by 0.35 s"
 
     def test_a_demand_may_fall_at_once_but_not_rise_at_once(self, monitor) -> None:
         assert monitor.take_demand(5e4, 0.0, NOW)

@@ -372,6 +372,27 @@ def test_a_dynamic_problem_s_lookahead_starts_from_each_axle_s_own_slip(power, s
     assert within_rounding(costs, lookahead_share(power, speed, front, rear, previous, (0.0, 0.0), CAR, table), 1e-6)
 
 
+@given(st.lists(st.floats(500.0, 20e3), min_size=3, max_size=3), st.floats(5.0, 30.0), SHARE)
+def test_over_noise_a_dynamic_problem_s_lookahead_takes_the_mean_of_all_of_the_cost(demands, speed, previous):
+    """Its slip follows the demand by itself, whatever jitters."""
+    problem = TABLE.problem._replace(slip_model=SLIP_DYNAMIC)
+    table = TABLE._replace(problem=problem, switching_cost_j=0.0, switching_fixed_cost_j=0.0)
+    jitter = no_jitter()._replace(samples_w=(*demands[1:], *(0.0,) * 8), taken=2, gain=0.5)
+    at = situation(demands[0], speed, 0.02, -0.01, previous)._replace(jitter=jitter)
+    ours = STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, table)
+    total = dict.fromkeys((previous, *table.share), 0.0)
+    for power, weight in zip(demands, (4.0 / 7.0, 2.0 / 7.0, 1.0 / 7.0), strict=True):
+
+        def outcome(share, power=power):
+            step = step_cost_and_next(power, speed, 0.02, -0.01, share, CAR, problem)
+            return step.cost_j, step.speed_mps, step.slip_front, step.slip_rear
+
+        costs = splits.bellman((power, speed, 0.02, -0.01), previous, table, outcome, steps=1.0 + 0.2 / problem.dt_s)
+        for share, cost in costs.items():
+            total[share] += weight * cost
+    assert within_rounding(total, ours, 1e-6)
+
+
 def test_the_lookahead_stays_where_changing_gains_nothing():
     flat = TABLE._replace(expected_cost_j=TABLE.expected_cost_j * 0.0, discount=0.0)
     dear = flat._replace(switching_fixed_cost_j=1e6)
@@ -531,6 +552,14 @@ def test_codes_stand_in_bags_and_never_change():
     }
     assert list(known) == sorted(known, key=known.__getitem__)
     assert [strategies.name_of(code) for code in known.values()] == list(known)
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_every_strategy_says_in_a_line_what_it_does(name):
+    said = strategies.meaning(name)
+    assert len(said) > 10
+    assert f"`{name}`" not in said
+    assert "\n" not in said
 
 
 def test_two_strategies_need_a_policy_and_one_knows_the_future():
