@@ -20,7 +20,7 @@ FloatArray = npt.NDArray[np.float64]
 #: Delays that are compared, beyond what is told, ns. One that is too short by 8 ms is borne, too long by 3 is not.
 BEYOND_NS = np.arange(-20_000_000, 30_000_001, 2_500_000)
 _TOLD = int(np.flatnonzero(BEYOND_NS == 0)[0])
-_SHORTEST_NS, _LONGEST_NS = int(BEYOND_NS[0]), int(BEYOND_NS[-1])
+_SHORTEST_NS, _LONGEST_NS = int(BEYOND_NS.min()), int(BEYOND_NS.max())
 #: A torque that changes by less from step to step tells nothing beside the noise of wheel speeds, N m.
 TELLING_NM = 100.0
 #: Wheels that are slower tell nothing: they stand, or are about to, rad/s.
