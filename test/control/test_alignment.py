@@ -156,3 +156,12 @@ def test_what_arrives_is_motor_brake_and_a_stuck_motor() -> None:
         brake_gain=(1.0, 0.5, 1.0, 1.0),
     )
     assert arrived_nm(command, m) == (-11.0, -6.0, -27.0, 26.0)
+
+
+def test_a_torque_of_long_ago_that_still_acted_is_remembered():
+    """Nothing else was commanded since: it belongs to speeds that come late."""
+    alignment = Alignment((1.0,) * 4, 0.0)
+    alignment.applied(0, (100.0,) * 4)
+    alignment.shift_nm(850 * MS, 0.01, 850 * MS, (50.0,) * 4)
+    alignment.applied(900 * MS, (-500.0,) * 4)
+    assert alignment.shift_nm(910 * MS, 0.01, 860 * MS, (50.0,) * 4) == pytest.approx((600.0,) * 4)

@@ -137,6 +137,14 @@ def test_three_wheels_tell_it_beside_one_that_is_wrong(wheel):
     assert not any(Wheels(jumping(), 0).found_ms(change=astray))
 
 
+@pytest.mark.parametrize("wheel", range(4))
+def test_one_wheel_tells_it_whose_torque_alone_changes(wheel):
+    wheels = Wheels(jumping(), 15)
+    wheels.torques = [tuple(t if i == wheel else -150.0 for i, t in enumerate(torque)) for torque in wheels.torques]
+    wheels.shown = [tuple(w if i == wheel else 900.0 for i, w in enumerate(shown)) for shown in wheels.shown]
+    assert wheels.found_ms()[-1] == 15
+
+
 def test_a_jump_of_all_wheels_is_no_delay():
     def jumped(k, shown):
         return tuple((0.75 if k >= 20 else 1.0) * w for w in shown)
