@@ -111,15 +111,14 @@ def _driven_slip_targets(speed_mps: float, slips: Wheels, motor_gain: Wheels, se
     the square of the speed, as yaw budgets do; at the rear at low speed with one over the speed, as where they brake.
     """
     most = settings.slip_target
-    front_left, front_right, rear_left, rear_right = motor_gain
+    front_left, front_right = motor_gain[0], motor_gain[1]
     left = right = rear = most
     part = settings.yaw_speed_mps / max(speed_mps, MOVING_MPS)
     if front_left != front_right:
         weaker = slips[1] if front_left > front_right else slips[0]
         beside = min(most, max(part * part * BESIDE_WEAK_SLIP, weaker))
         left, right = (beside, most) if front_left > front_right else (most, beside)
-    lost = min(front_left, front_right, rear_left, rear_right) < 1.0
-    if lost and min(slips[2], slips[3]) * speed_mps > LEAST_SLIP_SPEED_MPS:
+    if min(motor_gain) < 1.0 and min(slips[2], slips[3]) * speed_mps > LEAST_SLIP_SPEED_MPS:
         least = min(part, part * part) * settings.unequal_rear_slip_target
         rear = min(most, max(least, min(slips[0], slips[1])))
     return left, right, rear, rear

@@ -225,14 +225,15 @@ class Controller:
         monitor, supervision = self.monitor, self.supervision
         speed = monitor.speed_mps
         wheels = monitor.wheel_speed_radps
-        radius = self._vehicle.front.wheel.radius_m
+        front_m, rear_m = self._vehicle.front.wheel.radius_m, self._vehicle.rear.wheel.radius_m
         # One that comes more rarely than it should is the last one in between.
         lost = supervision.stale & STALE_SPEED and not self._is_due(now_ns)
         if lost and not supervision.stale & STALE_WHEELS:
             # The wheel that slips least tells the speed best.
-            speed = radius * (max(wheels, key=abs) if monitor.demand_w < 0.0 else min(wheels, key=abs))
+            rims = wheels[0] * front_m, wheels[1] * front_m, wheels[2] * rear_m, wheels[3] * rear_m
+            speed = max(rims, key=abs) if monitor.demand_w < 0.0 else min(rims, key=abs)
         elif supervision.stale & STALE_WHEELS and not supervision.stale & STALE_SPEED:
-            wheels = (speed / radius,) * 4
+            wheels = speed / front_m, speed / front_m, speed / rear_m, speed / rear_m
         if lost and not supervision.stale & STALE_DEMAND:
             monitor.demand_speed_mps = speed  # the sensor's last one was not that of this demand
         demand = shape_demand(monitor.demand_w, monitor.demand_speed_mps, speed, supervision)

@@ -110,7 +110,7 @@ def _acting(torques: Sequence[tuple[int, Wheels]], from_ns: int, to_ns: int) -> 
             acting.append(torque)
         if torque[0] <= from_ns:
             break
-    return acting[::-1] or [torques[0]]
+    return acting[::-1]
 
 
 def _means_nm(torques: Sequence[tuple[int, Wheels]], from_ns: int, to_ns: int) -> FloatArray:

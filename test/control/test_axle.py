@@ -98,10 +98,21 @@ def test_a_driven_front_wheel_beside_a_weaker_motor_slips_no_more_than_that_one_
     assert driven_targets(*(0.16,) * 4, gain=(weak, weak, 1.0, 1.0))[:2] == (MOST, MOST)
 
 
+@pytest.mark.parametrize(("gain", "front"), [((1.0, 0.0, 0.0, 1.0), (0.06, MOST)), ((0.0, 1.0, 1.0, 0.0), (MOST, 0.06))])
+def test_a_weak_rear_motor_changes_nothing_for_the_front_wheels(gain, front):
+    assert driven_targets(0.06, 0.06, 0.0, 0.0, gain=gain)[:2] == front
+
+
 def test_with_one_of_their_own_motors_lost_too_driven_rear_wheels_slip_no_more_than_the_front_ones():
     for gain in ((0.0, 0.0, 1.0, 1.0), (1.0, 1.0, 0.5, 1.0), (1.0, 1.0, 1.0, 0.5)):
         for fronts in ((0.06, 0.1), (0.1, 0.06)):
             assert driven_targets(*fronts, 0.16, 0.16, gain=gain) == (MOST, MOST, 0.06, 0.06)
+
+
+@pytest.mark.parametrize("wheel", range(4))
+def test_whichever_motor_is_lost_they_do(wheel):
+    gain = tuple(0.5 if i == wheel else 1.0 for i in range(4))
+    assert driven_targets(0.06, 0.06, 0.16, 0.16, gain=gain)[2:] == (0.06, 0.06)
 
 
 def test_what_they_may_slip_all_the_same_goes_with_the_square_of_the_speed():

@@ -53,6 +53,15 @@ def test_a_wheel_that_counts_teeth_is_smoothed_to_near_its_speed_half_as_many_me
         assert shown == pytest.approx((then,) * 4, abs=most + 1.0)
 
 
+def test_each_wheel_has_its_own_speed() -> None:
+    coarse, counted = Coarse(), [Counted(lambda t, own=own: own, 48) for own in (30.0, 40.0, 50.0, 60.0)]
+    for _ in range(60):
+        messages = [one.message() for one in counted]
+        shown = coarse.smoothed(tuple(message[i] for i, message in enumerate(messages)))
+    assert len(coarse.weights) > 1
+    assert shown == pytest.approx((30.0, 40.0, 50.0, 60.0), abs=2.0)
+
+
 @pytest.mark.parametrize("step", [0.0, 0.01, 0.03, 0.9 * FINE_RADPS])
 def test_wheels_with_steps_as_a_bus_has_are_taken_as_they_are(step) -> None:
     coarse = Coarse()

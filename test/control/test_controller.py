@@ -686,6 +686,22 @@ def test_with_the_speed_missing_it_believes_what_the_wheels_say(drive, demand) -
     assert drive.controller.believed_speed_mps == speed + 0.01
 
 
+@pytest.mark.parametrize("demand", [-8000.0, 5000.0])
+@pytest.mark.parametrize("larger", ["front", "rear"])
+def test_each_axle_s_own_wheels_tell_the_speed_and_are_told_by_it(larger, demand) -> None:
+    axle = getattr(VEHICLE, larger)
+    wheel = axle.wheel._replace(radius_m=1.2 * RADIUS)
+    drive = Drive(vehicle=VEHICLE._replace(**{larger: axle._replace(wheel=wheel)}))
+    turning = (10.0 / (1.2 * RADIUS),) * 2, (10.0 / RADIUS,) * 2
+    wheels = sum(turning if larger == "front" else turning[::-1], ())
+    drive.run(60, wheels=wheels, demand=demand)
+    without_speed = drive.run(10, wheels=wheels, demand=demand, without=("speed",))
+    assert without_speed["speed_mps"] == pytest.approx(10.0)
+    drive.run(60, wheels=wheels, demand=demand)
+    without_wheels = drive.run(10, demand=demand, without=("wheels",))
+    assert [without_wheels[f"{name}_speed_radps"] for name in NAMES] == pytest.approx(wheels)
+
+
 def test_with_speed_and_wheels_missing_it_believes_the_last_speed(drive) -> None:
     drive.run(60, speed=10.0, demand=-8000.0)
     drive.run(60, demand=-8000.0, without=("speed", "wheels"))

@@ -323,6 +323,38 @@ def test_with_a_budget_a_change_away_from_the_middle_has_to_be_worth_more_than_t
     assert share(max(pays * (1.0 - 1e-6), 0.0)) == (other if pays > 0.0 else previous)
 
 
+@given(
+    st.lists(st.floats(500.0, 20e3), min_size=2, max_size=2),
+    st.floats(5.0, 30.0),
+    st.sampled_from([(0.1, -0.02), (-0.02, 0.1)]),
+    st.sampled_from([(0.5, 1.0), (0.5, 0.0)]),
+)
+def test_so_it_has_in_a_dynamic_problem_from_each_axle_s_own_slip(demands, speed, slips, shares):
+    previous, other = shares
+    jitter = no_jitter()._replace(samples_w=(demands[1], *(0.0,) * 9), taken=1, gain=0.5)
+    at = situation(demands[0], speed, *slips, previous)._replace(jitter=jitter)
+    problem = TABLE.problem._replace(slip_model=SLIP_DYNAMIC, dt_s=0.2)
+    table = BUDGETED._replace(problem=problem, discount=0.0, share=np.array([other]), switching_fixed_cost_j=0.0)
+    weights = np.array([2.0, 1.0]) / 3.0
+
+    def cost_j(power, share):
+        return step_cost_and_next(power, speed, *slips, share, CAR, problem).cost_j
+
+    saved = np.array([cost_j(power, previous) - cost_j(power, other) for power in demands])
+    mean = weights @ saved
+    chance = math.sqrt(weights @ (saved - mean) ** 2 * (weights @ weights))
+    worth = (0.5 + (0.5 * 0.8 + 0.2) / 0.2) * (mean - chance) - splits.TELLS_APART_W * 0.2
+    pays = worth / splits.price_units(other - previous)
+    assume(abs(pays) > 0.1)
+
+    def share(price):
+        chosen = table._replace(switching_cost_j=price)
+        return STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, chosen)
+
+    assert share(max(pays * (1.0 + 1e-6), 0.0)) == previous
+    assert share(max(pays * (1.0 - 1e-6), 0.0)) == (other if pays > 0.0 else previous)
+
+
 @pytest.mark.parametrize("k", range(SAMPLES))
 def test_each_demand_that_a_jitter_holds_counts_in_its_place(k):
     # Only one of them has something dear to follow, with the share as it is; all else is less than a change costs.
