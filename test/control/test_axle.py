@@ -98,7 +98,9 @@ def test_a_driven_front_wheel_beside_a_weaker_motor_slips_no_more_than_that_one_
     assert driven_targets(*(0.16,) * 4, gain=(weak, weak, 1.0, 1.0))[:2] == (MOST, MOST)
 
 
-@pytest.mark.parametrize(("gain", "front"), [((1.0, 0.0, 0.0, 1.0), (0.06, MOST)), ((0.0, 1.0, 1.0, 0.0), (MOST, 0.06))])
+@pytest.mark.parametrize(
+    ("gain", "front"), [((1.0, 0.0, 0.0, 1.0), (0.06, MOST)), ((0.0, 1.0, 1.0, 0.0), (MOST, 0.06))]
+)
 def test_a_weak_rear_motor_changes_nothing_for_the_front_wheels(gain, front):
     assert driven_targets(0.06, 0.06, 0.0, 0.0, gain=gain)[:2] == front
 
