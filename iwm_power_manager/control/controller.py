@@ -230,7 +230,8 @@ class Controller:
         lost = supervision.stale & STALE_SPEED and not self._is_due(now_ns)
         if lost and not supervision.stale & STALE_WHEELS:
             # The wheel that slips least tells the speed best.
-            rims = wheels[0] * front_m, wheels[1] * front_m, wheels[2] * rear_m, wheels[3] * rear_m
+            radii = front_m, front_m, rear_m, rear_m
+            rims = [turning * radius_m for turning, radius_m in zip(wheels, radii, strict=True)]
             speed = max(rims, key=abs) if monitor.demand_w < 0.0 else min(rims, key=abs)
         elif supervision.stale & STALE_WHEELS and not supervision.stale & STALE_SPEED:
             wheels = speed / front_m, speed / front_m, speed / rear_m, speed / rear_m
