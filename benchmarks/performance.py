@@ -16,6 +16,7 @@ import argparse
 import contextlib
 import dataclasses
 import functools
+import gc
 import hashlib
 import json
 import math
@@ -334,7 +335,8 @@ def step(repeat: int) -> dict[str, Any]:
     """Times of single steps from checked inputs to commands, as the node runs them, without DDS; the slowest count.
 
     Every drive takes the same steps, so a step's own time is the median of its times in three drives: what interrupts
-    the machine meets another step each time. A loop of additions that takes as long says how much that is.
+    the machine meets another step each time. A loop of additions that takes as long says how much that is. Garbage is
+    not collected within a step, as in the node (`ros/realtime.py`).
     """
     from iwm_power_manager.cycle import load_cycle
     from iwm_power_manager.share import resolve
@@ -344,7 +346,9 @@ def step(repeat: int) -> dict[str, Any]:
 
     scenario = on_cycle(load_vehicle(resolve("jalalmaab_2015"), "drag"), load_cycle(resolve("nycc")), FRICTION)
     drives: list[Any] = []
+    gc.disable()
     for _ in range(repeat + 3):
+        gc.collect()
         controller = controller_of(scenario)
         own, taken = controller.step, []
 
@@ -357,6 +361,7 @@ def step(repeat: int) -> dict[str, Any]:
         controller.step = timed  # type: ignore[method-assign]
         drive_scenario(scenario, controller)
         drives.append(np.array(taken))
+    gc.enable()
     drives = drives[1:]
     middle, single = np.percentile(drives, (50, 99), axis=1)[..., 1]
     slow = np.array([np.percentile(np.median(drives[k : k + 3], axis=0), 99, axis=0) for k in range(repeat)])

@@ -151,7 +151,8 @@ def judge(state: ActuatorState, reported_nm: Wheels, dt_s: float, limits: Actuat
         return state
     sent = zip(*[torque_nm for _, torque_nm in state.recent], strict=True)
     reports = [(reported, min(one), max(one)) for reported, one in zip(reported_nm, sent, strict=True)]
-    if state.reporting and all(motor.spotless for motor in state.motors) and all(_within(*r, limits) for r in reports):
+    obeyed = all(motor.spotless for motor in state.motors) and all(_within(*report, limits) for report in reports)
+    if obeyed and (state.reporting or not any(_follows(*report, limits) for report in reports)):
         return state  # as nearly always
     if (state.all_dead or not state.reporting) and any(_follows(*report, limits) for report in reports):
         state = ActuatorState((Evidence(),) * 4 if state.all_dead else state.motors, state.recent, True)
