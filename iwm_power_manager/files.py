@@ -160,6 +160,11 @@ def make_folder(path: Path | str, *, new: bool = False) -> Path:
     return folder
 
 
+def friction_in_name(friction: float) -> str:
+    """A friction as it stands in names of files: in hundredths, 050 for 0.5, with as many digits as tell it."""
+    return f"{100.0 * friction:.6g}".zfill(3)
+
+
 @contextmanager
 def no_empty_remains(folder: Path | str) -> Iterator[None]:
     """Whatever ends what is done meanwhile, a folder that was not there before is not left without a file in it."""

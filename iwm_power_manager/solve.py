@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from iwm_power_manager.control.budget import DEARER
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.files import friction_in_name
 from iwm_power_manager.mdp.budget import Trial, find_price
 from iwm_power_manager.mdp.certify import bellman_residual_j
 from iwm_power_manager.mdp.demand import DemandChain, Source
@@ -69,7 +70,7 @@ def targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequenc
     except OSError as error:
         raise ConfigError("arguments", "--output", f"{output}: {error.strerror}", "a folder or a .npz file") from None
     stem = re.sub(r"[^a-z0-9]+", "_", f"{vehicle.name} {vehicle.idle_drive} {problem.name}".lower()).strip("_")
-    return [output / f"{stem}_mu{f'{100.0 * friction:.6g}'.zfill(3)}.npz" for friction in frictions]
+    return [output / f"{stem}_mu{friction_in_name(friction)}.npz" for friction in frictions]
 
 
 def solve_one(

@@ -11,8 +11,9 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from iwm_power_manager import __version__
 from iwm_power_manager.command_line import CommandParser, Written
@@ -120,6 +121,11 @@ def write_json(path: Path | str, value: Any) -> None:
 
 #: Endings of a picture's name, and what would make its bytes differ from run to run or say who drew it.
 PICTURES = {".pdf": {"CreationDate": None}, ".png": {"Software": None}, ".svg": {"Date": None}}
+
+
+def beside_json(json: str | None) -> redirect_stdout[TextIO]:
+    """Where results are printed for people: where JSON goes to standard output, nothing else does."""
+    return redirect_stdout(sys.stderr if json == "-" else sys.stdout)
 
 
 def output_file(text: str) -> Written:

@@ -6,9 +6,7 @@ A saving counts only where the run and that of equal split held the trace over t
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
-from contextlib import redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.tools.command import write_json, write_picture
+from iwm_power_manager.tools.command import beside_json, write_json, write_picture
 from iwm_sim.fleet.store import Store
 from iwm_sim.fleet.task import Drive, Road, Solve
 from iwm_sim.study.names import REFERENCE
@@ -268,7 +266,7 @@ def make(folder: Path, page: Path, picture: Path | None = None, numbers: str | N
     store = Store(folder)
     made, savings = page_of(store)
     write_page(page, made)
-    with redirect_stdout(sys.stderr if numbers == "-" else sys.stdout):  # nothing else in what a program is to read
+    with beside_json(numbers):
         if savings:
             print(plain_table(savings, _SAVINGS))
         print(f"page: {page}")

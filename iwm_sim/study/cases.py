@@ -23,7 +23,7 @@ from iwm_power_manager.control.strategies import STRATEGIES
 from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.cycle import Cycle, load_cycle
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import atomic_write
+from iwm_power_manager.files import atomic_write, friction_in_name
 from iwm_power_manager.model.parameters import VehicleParams
 from iwm_power_manager.policy import Policy, PolicyBank, load_policy
 from iwm_power_manager.share import resolve
@@ -324,8 +324,8 @@ def check(case: Case) -> None:
 def save_series(folder: Path | str, made: Result) -> None:
     """Write what a result kept as a compressed .npz named after the case; `ConfigError` if it cannot be written."""
     case = made.case
-    friction = f"{100.0 * case.friction:.6g}".zfill(3)
-    name = f"{cycle_of(case.cycle).name}_{case.idle_drive}_mu{friction}_{case.name}.npz"
+    road = f"mu{friction_in_name(case.friction)}"
+    name = f"{cycle_of(case.cycle).name}_{case.idle_drive}_{road}_{case.name}.npz"
     stream = io.BytesIO()
     np.savez_compressed(stream, allow_pickle=False, **made.series)
     atomic_write(Path(folder) / name, stream.getvalue())

@@ -11,7 +11,6 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stdout
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -21,7 +20,7 @@ from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, STRATEGIES, d
 from iwm_power_manager.errors import IwmError
 from iwm_power_manager.exit_codes import INTERRUPTED
 from iwm_power_manager.model.parameters import IDLE_DRIVES
-from iwm_power_manager.tools.command import output_file, write_json
+from iwm_power_manager.tools.command import beside_json, output_file, write_json
 from iwm_power_manager.tools.options import number
 from iwm_power_manager.tools.progress import show_compiling
 
@@ -130,9 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for wanted in (signal.SIGINT, signal.SIGTERM):
         signal.signal(wanted, _terminated)
     try:
-        with redirect_stdout(
-            sys.stderr if plan.json == "-" else sys.stdout
-        ):  # nothing else in what a program is to read
+        with beside_json(plan.json):
             code, content = run(plan)
         if plan.json:
             write_json(plan.json, content)

@@ -17,7 +17,7 @@ from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.errors import ConfigError
-from iwm_power_manager.files import atomic_write, make_folder
+from iwm_power_manager.files import atomic_write, friction_in_name, make_folder
 from iwm_power_manager.tools.command import PICTURES, doubts, made_with, write_json, write_picture
 from iwm_power_manager.tools.progress import Bar
 from iwm_sim.closed_loop import COLUMNS as SIGNALS
@@ -324,10 +324,8 @@ def _frontier(options: argparse.Namespace) -> None:
             for friction in options.friction or [0.9]:
                 place = frontier.Place(f"{vehicle.name} on {cycle.name}", vehicle, cycle, friction)
                 found.append(unseen.budgets_of(place, options.budgets or frontier.BUDGETS_PER_MIN))
-                picture = (
-                    folder
-                    / f"{vehicle.name}_{vehicle.idle_drive}_{cycle.name}_{f'{100.0 * friction:.6g}'.zfill(3)}.svg"
-                )
+                name = f"{vehicle.name}_{vehicle.idle_drive}_{cycle.name}_{friction_in_name(friction)}"
+                picture = folder / f"{name}.svg"
                 frontier_figure.draw_frontier(found[-1], picture)
                 if not options.quiet:
                     _show_frontier(found[-1], picture)

@@ -104,6 +104,20 @@ def within_rounding(costs, ours, slack):
     return costs[ours] <= min(costs.values()) + slack
 
 
+def it_changes_where_it_pays(worth_j, at, table):
+    """The only other share there is, at a price a little below what the change is worth, and not a little above it."""
+    previous, (other,) = at.previous_share, table.share
+    pays = worth_j / splits.price_units(other - previous)
+    assume(abs(pays) > 0.1)
+
+    def share(price):
+        chosen = table._replace(switching_cost_j=price)
+        return STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, chosen)
+
+    assert share(max(pays * (1.0 + 1e-6), 0.0)) == previous
+    assert share(max(pays * (1.0 - 1e-6), 0.0)) == (other if pays > 0.0 else previous)
+
+
 @given(POWER)
 def test_the_rule_is_one_line_for_driving_and_one_for_braking(power):
     assert rule_share(power, TABLE) == pytest.approx(splits.rule(power, TABLE.rule))
@@ -312,15 +326,7 @@ def test_with_a_budget_a_change_away_from_the_middle_has_to_be_worth_more_than_t
         chance = 0.0
     # Two samples more at this gain: 0.2 s; and 0.8 s of which half count, for the forecast that does not.
     worth = (0.5 + (0.5 * 0.8 + 0.2) / 0.2) * (mean - chance) - splits.TELLS_APART_W * 0.2
-    pays = worth / splits.price_units(other - previous)
-    assume(abs(pays) > 0.1)
-
-    def share(price):
-        chosen = table._replace(switching_cost_j=price)
-        return STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, chosen)
-
-    assert share(max(pays * (1.0 + 1e-6), 0.0)) == previous
-    assert share(max(pays * (1.0 - 1e-6), 0.0)) == (other if pays > 0.0 else previous)
+    it_changes_where_it_pays(worth, at, table)
 
 
 @given(
@@ -344,15 +350,7 @@ def test_so_it_has_in_a_dynamic_problem_from_each_axle_s_own_slip(demands, speed
     mean = weights @ saved
     chance = math.sqrt(weights @ (saved - mean) ** 2 * (weights @ weights))
     worth = (0.5 + (0.5 * 0.8 + 0.2) / 0.2) * (mean - chance) - splits.TELLS_APART_W * 0.2
-    pays = worth / splits.price_units(other - previous)
-    assume(abs(pays) > 0.1)
-
-    def share(price):
-        chosen = table._replace(switching_cost_j=price)
-        return STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, chosen)
-
-    assert share(max(pays * (1.0 + 1e-6), 0.0)) == previous
-    assert share(max(pays * (1.0 - 1e-6), 0.0)) == (other if pays > 0.0 else previous)
+    it_changes_where_it_pays(worth, at, table)
 
 
 @pytest.mark.parametrize("k", range(SAMPLES))
