@@ -36,7 +36,7 @@ _MIXED = 0.02
 #: A loss so many times that between its neighbours, or so little of it, is a wrong number.
 _APART = 8.0
 _MOST_ALONE = 5
-#: Speeds of no unit that go further than this, rad/s, may be in rpm: a wheel's at 350 km/h do not.
+#: Speeds of no unit by which wheels turn faster than this, rad/s, may be in rpm: at 350 km/h they do not.
 _MOST_UNNAMED = 300.0
 #: No car's motor has more, N m: those are speeds, or N mm.
 _MOST_NM = 5000.0
@@ -119,9 +119,9 @@ def read_points(
         if key in points:
             raise ConfigError(path, f"line {line}", f"repeats speed {speed:g}, torque {torque:g}")
         points[key] = _efficiency(path, line, key, value / 100.0 if percent else value, quantity)
-    fastest = max((speed for speed, _ in points), default=0.0) * gear
+    fastest = max((speed for speed, _ in points), default=0.0)
     if speed_unit == _GUESSED and fastest > _MOST_UNNAMED:
-        doubts.append(f"speeds up to {fastest:g} of no unit are taken for rad/s: rpm? --speed-unit says it")
+        doubts.append(f"speeds up to {gear * fastest:g} of no unit are taken for rad/s: rpm? --speed-unit says it")
     most_nm = max((abs(torque) for _, torque in points), default=0.0) / gear
     if most_nm > _MOST_NM:
         doubts.append(f"torques up to {most_nm:g} N m at the motor: {'--down' if layout == 'matrix' else 'unit'}?")

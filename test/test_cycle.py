@@ -155,6 +155,12 @@ def test_resampling_is_linear_and_starts_at_zero():
     assert cycle.grade.tolist() == pytest.approx([0.0, 0.05, 0.1, 0.1, 0.1, 0.1, 0.1])
 
 
+def test_a_gap_is_known_of_the_same_trace_at_another_step(write):
+    cycle = load_cycle(write("time_s,speed_mps\n0,5\n1,5\n2,5\n60,5\n61,5\n"))
+    assert cycle.gap
+    assert cycle.resample(0.1).gap == cycle.gap
+
+
 @given(st.integers(1, 400), st.sampled_from([0.01, 0.02, 0.05, 0.1, 0.25]))
 def test_resampling_loses_no_whole_step_to_rounding(steps, dt_s):
     assert make_cycle("made", [0.0, steps * dt_s], [1.0, 1.0]).resample(dt_s).time_s.size == steps + 1

@@ -508,5 +508,5 @@ def test_a_mapping_that_cannot_work_is_one_line_that_names_the_key(
     )
     assert running.wait() == BAD_INPUT
     (line,) = [line for line in running.text().splitlines() if line.startswith("[ERROR]")]
-    assert f"{path}: " in line
+    assert f"parameter signals_file: {path}: " in line
     assert problem in line

@@ -249,7 +249,14 @@ def test_speeds_taken_for_torques_are_warned_of(tmp_path, capsys):
 
 def test_speeds_of_no_unit_that_are_high_for_rad_s_are_warned_of(tmp_path, capsys):
     sheet = "speed,torque,efficiency\n" + "".join(f"{s},{t},0.8{t}\n" for s in (0, 100, {}) for t in (1, 5))
-    for fastest, options, warned in ((3000, (), True), (300, (), False), (3000, ("--speed-unit", "rad/s"), False)):
+    geared = "--gear", "9"
+    for fastest, options, warned in (
+        (3000, (), True),
+        (300, (), False),
+        (3000, ("--speed-unit", "rad/s"), False),
+        (3000, geared, True),
+        (1500, geared, False),
+    ):
         (tmp_path / "sheet.csv").write_text(sheet.replace("{}", str(fastest)))
         code, _, err = run(capsys, tmp_path / "sheet.csv", *options, "--output", tmp_path / "map.csv")
         assert code == 0
