@@ -5,8 +5,13 @@ from __future__ import annotations
 
 import pytest
 
-from iwm_power_manager.control.direction import MOVING_MPS, travel_direction, turned_to
-from iwm_power_manager.control.types import WheelState, initial_state
+from iwm_power_manager.control.direction import MOVING_MPS, hold_torque_nm, travel_direction, turned_to
+from iwm_power_manager.control.motion import Motion
+from iwm_power_manager.control.types import Measurement, WheelState, initial_state
+from iwm_power_manager.share import share_path
+from iwm_power_manager.vehicle import load_vehicle
+
+CAR = load_vehicle(share_path("config/vehicles/jalalmaab_2015.yaml")).params
 
 
 def remembered(k):
@@ -52,3 +57,11 @@ def test_driving_it_is_the_one_asked_for_and_braking_the_one_the_car_moves_in(be
         assert travel_direction(-1.01 * MOVING_MPS, -5e3, asked, before) == -1.0
         assert travel_direction(0.99 * MOVING_MPS, -5e3, asked, before) == before
         assert travel_direction(-0.99 * MOVING_MPS, -5e3, asked, before) == before
+
+
+@pytest.mark.parametrize(("change_nm", "fades"), [(0.9, True), (-0.9, True), (1.1, False), (-1.1, False)])
+def test_a_hold_fades_once_the_motors_change_by_less_than_one_newton_metre(change_nm, fades):
+    motion = Motion(0.0, (0.0, 0.0, 0.0, 0.0), 1.0, 0)
+    measurement = Measurement(0.0, (0.0, 0.0, 0.0, 0.0), 3e3, 0.01, 0.9, 1e5, 1e5, 0.5)
+    held = hold_torque_nm(100.0, motion, measurement, 80.0 + change_nm, 80.0, CAR)
+    assert held < 100.0 if fades else held == 100.0

@@ -312,3 +312,36 @@ def test_it_decides_which_policy_a_strategy_uses_and_nothing_else(frictions, dem
 
     known = FrictionState(SideGrip(left, 1.0), SideGrip(right, 1.0), start.friction.wheels, assumed)
     assert torques(start._replace(friction=known), told) == torques(start, 0.9)
+
+
+def test_a_strategy_is_given_it_to_the_nearest_hundredth():
+    drive, changes = Drive(), 0
+    for k in range(300):
+        before = drive.state.friction.assumed
+        grip = drive.step((0.3, 0.4, 0.3, 0.4), 0.08 * math.sin(k / 40.0))
+        if grip.assumed != before:
+            changes += 1
+            assert grip.assumed == pytest.approx(min(grip.left.friction, grip.right.friction), abs=0.00501)
+    assert changes > 3
+
+
+def test_no_single_step_of_a_wheel_that_slips_takes_more_than_a_sixth():
+    drive = Drive()
+    drive.gently(0.9, 300)
+    for _ in range(15):
+        before = drive.state.friction.left.friction
+        assert drive.step((0.2, 0.9, 0.2, 0.9), -0.5).left.friction > (1.0 - 1.0 / 6.0) * before
+    assert drive.state.friction.left.friction < 0.25
+
+
+def test_where_the_road_takes_less_the_more_torque_there_is_no_slope_is_told():
+    """Not even where slip goes with the torque: as of a speed that comes before its torque."""
+    start, friction = initial_state().wheels[0], initial_state().friction
+    rolling, swing_nm = 15.0 / RADIUS, 20.0
+    speed = rolling
+    for k in range(1000):
+        torque = swing_nm * (-1.0) ** k
+        wheels = (start._replace(total_nm=torque, speed_radps=speed),) * 4
+        speed = rolling + torque * DT / CAR.front.wheel.inertia_kgm2
+        friction = estimate(friction, wheels, (speed,) * 4, 15.0, True, k == 0, DT, SETTINGS, CAR)
+    assert friction.left == friction.right == SideGrip(SETTINGS.friction_prior, 0.0)

@@ -577,3 +577,13 @@ def test_an_accelerometer_that_contradicts_four_skidding_wheels_and_their_sensor
         given = (-60.0,) * 4
         motion = car.brake(given, given, (1.0 - skid,) * 4, True, spoil_speed=lambda v, skid=skid: skid * v)
     assert motion.speed_mps == pytest.approx(car.v, abs=0.15 * car.v)
+
+
+@pytest.mark.parametrize(("torque", "slip"), [(60.0, 0.03), (-60.0, -0.03)])
+def test_wheels_that_slip_a_little_do_not_pull_where_a_sensor_is_believed(torque, slip):
+    car = Car(8.0)
+    for k in range(100):
+        shown = car.v
+        car.step(torque, wheels=lambda v: [(1.0 + slip) * v / RADIUS] * 4)
+        # In the first steps they do: the wheels jump to their slip.
+        assert k < 5 or car.state.motion.speed_mps == pytest.approx(shown, abs=1e-9)

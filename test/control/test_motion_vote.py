@@ -183,7 +183,8 @@ def test_wheels_outvote_the_forces_without_a_sensor_only_where_all_of_them_are_d
 
 def test_a_sensor_alone_is_right_where_an_accelerometer_has_felt_what_it_shows():
     agreed = Agreed(0.5, 21.0, 3.0, math.nan)
-    for felt, right in ((-1.0, True), (3.0, False)):
+    # The forces say 3 m/s more and the speeds 1 m/s less: what is felt has to be nearer to the speeds by half.
+    for felt, right in ((-1.0, True), (0.3, True), (0.4, False), (3.0, False)):
         skid = agreed._replace(felt_mps=felt)
         assert voted(20.0, (12.0,) * 4, 25.0, skid, torque_nm=-300.0, felt_mps2=0.0)[2] is right
     assert not voted(20.0, (12.0,) * 4, 25.0, agreed, torque_nm=-300.0)[2]

@@ -96,3 +96,8 @@ def test_without_noise_nothing_is_held_and_with_noise_until_the_signal_is_as_unc
 def test_nothing_is_known_before_the_first_demand():
     assert no_jitter().gain == 1.0 and no_jitter().taken == 0
     assert observed(no_jitter(), 5.0, 10.0, 0.01).samples_w[0] == 5.0
+
+
+def test_nothing_but_noise_is_averaged_over_all_that_is_remembered():
+    assert lasting_gain(2.0, -1.0) == pytest.approx(0.1)
+    assert lasting_gain(1.9, -1.0) == pytest.approx(0.1)

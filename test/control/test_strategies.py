@@ -676,3 +676,7 @@ def test_without_a_demand_the_split_stays_as_it_is(strategy, power):
 def test_a_watt_is_a_demand():
     assert choose("rule", 1.0) == 1.0
     assert choose("rule", -1.0) == 1.0
+
+
+def test_without_a_policy_the_shares_to_choose_from_are_twentieths():
+    assert empty_table().share == pytest.approx([part / 20.0 for part in range(21)])

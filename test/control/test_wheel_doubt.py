@@ -218,3 +218,18 @@ def test_no_factor_is_beyond_the_bounds_and_one_near_to_one_is_tyre_wear(before)
         assert combined_factor(before, outside / before) == before
     for worn in (1.0 - 0.9 * WORN_PART, 1.0 + 0.9 * WORN_PART):
         assert combined_factor(before, worn / before) == 1.0
+
+
+@WHEELS
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_torque_towards_the_car_s_speed_explains_no_jump_away_from_it(wheel, sign):
+    assert judged(wheel, sign * 3.0, sign * 1.1 * JUMP_RADPS, torque_nm=-sign * 400.0)[1] > 0.0
+
+
+@WHEELS
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_gated_wheel_that_is_hardly_away_and_comes_back_has_not_stayed_away(wheel, sign):
+    inertia = (CAR.front if wheel < 2 else CAR.rear).wheel.inertia_kgm2
+    back = -sign * ICE_FRICTION * LOAD_NM / inertia * DT
+    assert judged(wheel, sign * 0.7, 1.1 * back, gated=True)[0] == 0.0
+    assert judged(wheel, sign * 0.7, 0.9 * back, gated=True)[0] == DT
