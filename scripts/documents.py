@@ -362,14 +362,40 @@ def mutation_table(stored: str) -> str:
     return markdown_table(_mutants(stored), columns)
 
 
+def mutation_sample() -> str:
+    """What a sample of all changes said: how many, with the interval that it leaves open, and of which modules."""
+    stored = json.loads((_ROOT / "docs" / "mutation_sample.json").read_text(encoding="utf-8"))
+    rows = _mutants("mutation_sample.json")
+    columns: list[Column[dict[str, Any]]] = [
+        Column("module", lambda row: row["module"]),
+        *(Column(name, operator.itemgetter(name), decimals=0) for name in ("places", "mutants", "killed")),
+    ]
+    return (
+        f'`make mutation ARGS="--sample {stored["sample"]} --seed {stored["seed"]}"`: {_killed_of_sample(rows[-1])}.'
+        f"\n\n{markdown_table(rows, columns)}"
+    )
+
+
+def _killed_of_sample(row: dict[str, Any]) -> str:
+    """Wilson's interval at 95 %."""
+    n, part, z2 = row["mutants"], row["percent"] / 100.0, 1.96**2
+    middle, half = part + z2 / (2 * n), math.sqrt(z2 * (part * (1.0 - part) / n + z2 / (4 * n * n)))
+    low, high = (100.0 * (middle + side * half) / (1.0 + z2 / n) for side in (-1.0, 1.0))
+    return (
+        f"of {n} changes drawn from all {row['places']} places {row['killed']} ({row['percent']:.1f} %) made a test "
+        f"fail; with 95 % confidence {low:.1f} to {high:.1f} % of all do"
+    )
+
+
 def mutation_sentence() -> str:
     """The same in a sentence."""
-    (*_, whole), (*_, swaps) = _mutants("mutation.json"), _mutants("swaps.json")
+    (*_, whole), (*_, swaps), (*_, drawn) = map(_mutants, ("mutation.json", "swaps.json", "mutation_sample.json"))
     return (
         f"All {whole['mutants']} changes that `make mutation` made in these modules in version 0.1.0 were tried, and "
-        f"{whole['killed']} of them ({whole['percent']:.1f} %) made a test fail. Today {swaps['killed']} of all "
-        f"{swaps['mutants']} swaps of front and rear or left and right do. [mutation.md](mutation.md) has the tables "
-        "and says of survivors why no test can tell."
+        f"{whole['killed']} of them ({whole['percent']:.1f} %) made a test fail. Of today's law a sample was tried: "
+        f"{_killed_of_sample(drawn)}, before tests were written for those that went unnoticed. Today "
+        f"{swaps['killed']} of all {swaps['mutants']} swaps of front and rear or left and right do. "
+        "[mutation.md](mutation.md) has the tables and says of survivors why no test can tell."
     )
 
 
@@ -405,6 +431,7 @@ MEASURED: dict[str, Callable[[], str]] = {
     "make faults": faults_table,
     "make mutation: table": lambda: mutation_table("mutation.json"),
     "make mutation: swaps": lambda: mutation_table("swaps.json"),
+    "make mutation: sample": mutation_sample,
     "make mutation: sentence": mutation_sentence,
     "make soak": soak_table,
     "benchmarks/performance.py": lambda: _of_benchmark("performance", "table", "performance.json"),
