@@ -219,3 +219,7 @@ def test_an_accelerometer_that_has_felt_what_the_forces_say_keeps_wheels_that_mi
     agreed = Agreed(1.5, 24.0, 0.8, 0.0)
     assert not voted(20.0, (20.0,) * 4, 25.0, agreed, torque_nm=-60.0, felt_mps2=0.0)[2]
     assert voted(20.0, (20.0,) * 4, 25.0, agreed, torque_nm=-60.0)[2]
+    # Of the 4 m/s that the speeds have lost it has felt none: the forces have to be nearer to that by half.
+    for moved, right in ((1.9, False), (2.1, True), (3.0, True)):
+        skid = agreed._replace(moved_mps=moved)
+        assert voted(20.0, (20.0,) * 4, 25.0, skid, torque_nm=-60.0, felt_mps2=0.0)[2] is right
