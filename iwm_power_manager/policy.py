@@ -44,7 +44,7 @@ from iwm_power_manager.control.strategies import STRATEGIES, name_of
 from iwm_power_manager.control.table import PolicyTable, as_vector, empty_table
 from iwm_power_manager.errors import ConfigError, PolicyError
 from iwm_power_manager.files import atomic_write, check_name, check_number, content_sha256
-from iwm_power_manager.mdp.budget import Trial
+from iwm_power_manager.mdp.budget import Trial, elasticity_of
 from iwm_power_manager.mdp.demand import DemandChain, Source
 from iwm_power_manager.mdp.policy_iteration import Iteration, Solution
 from iwm_power_manager.mdp.problem import FORMAT as PROBLEM_FORMAT
@@ -169,6 +169,7 @@ class Policy:
             schedule=as_vector(schedule, 1),
             changes_per_min=problem.changes_per_min,
             dearer_cost_j=dearer,
+            elasticity=elasticity_of(self.trials, problem.switching_cost_j, problem.changes_per_min),
         )
 
 

@@ -23,8 +23,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from iwm_power_manager.control.budget import ELASTICITY, THERE_AND_BACK, buckets
+from iwm_power_manager.control.budget import THERE_AND_BACK, buckets
 from iwm_power_manager.control.settings import DEFAULTS
+from iwm_power_manager.mdp.budget import elasticity_of
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.command import plain
@@ -162,11 +163,12 @@ def trials(_: Study) -> str:
     policy = load_policy(share_path("policies/jalalmaab_2015_drag_coupled_mu090.npz"))
     tried = "".join(f"{trial.price_j:.4g}: {trial.changes_per_min:<8.3g}" for trial in policy.trials)
     problem = policy.problem
-    spread = ELASTICITY * (buckets(problem.changes_per_min).lasting - THERE_AND_BACK) ** 2
+    elasticity = elasticity_of(policy.trials, problem.switching_cost_j, problem.changes_per_min)
+    spread = elasticity * (buckets(problem.changes_per_min).lasting - THERE_AND_BACK) ** 2
     loss_j = problem.changes_per_min * problem.switching_cost_j * math.pi**2 / (8.0 * spread)
     return (
         f"Of the shipped policy (idle drive drag, friction {policy.friction:g}, {policy.identity}; all trials are in "
-        f"the file; b x price x pi^2 / (8 e B^2), see below, is {loss_j:.2f} J a minute):\n\n"
+        f"the file; e, see below, is {elasticity:.2f}, and b x price x pi^2 / (8 e B^2) {loss_j:.2f} J a minute):\n\n"
         f"```\nprice of a change, J: changes a minute\n  {tried.rstrip()}\n```"
     )
 

@@ -18,6 +18,7 @@ from iwm_power_manager import archive
 from iwm_power_manager import policy as policy_module
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.errors import PolicyError
+from iwm_power_manager.mdp.budget import Trial
 from iwm_power_manager.mdp.demand import Source, demand_chain
 from iwm_power_manager.mdp.policy_iteration import solve
 from iwm_power_manager.mdp.problem import load_problem
@@ -168,6 +169,15 @@ def test_rule_and_schedule_travel_in_the_table(policy):
     assert table.rule.tolist() == [1.0, 0.2, 3.0, 0.4]
     assert table.schedule.tolist() == [0.1, 0.9]
     assert policy.table().rule.tolist() == [0.0, 0.5, 0.0, 0.5]
+
+
+def test_how_much_a_dearer_change_is_shunned_is_what_the_search_for_the_price_found(policy):
+    budgeted = dataclasses.replace(policy.problem, changes_per_min=8.0, switching_cost_j=20.0)
+    searched = dataclasses.replace(
+        policy, problem=budgeted, trials=(Trial(20.0, 8.0), Trial(60.0, 8.0 - 1.6 * np.log(3.0)))
+    )
+    assert searched.table().elasticity == pytest.approx(0.2)
+    assert dataclasses.replace(searched, trials=()).table().elasticity == empty_table().elasticity
 
 
 def test_strategies_without_a_policy_get_a_table_of_the_same_type(policy):

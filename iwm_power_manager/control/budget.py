@@ -36,10 +36,11 @@ LASTING_MIN = 5.0
 #: The second one holds this many, and leaks at this many times the budget.
 MINUTE_MIN, MINUTE_LEAK = 2.5, 2.0
 
-#: What a price that is higher by one in the logarithm takes from the changes, as a part of the budget.
-ELASTICITY = 0.35
+#: What a price that is higher by one in the logarithm takes from the changes, as a part of the budget, where no solver
+#: has tried prices (docs/solver.md).
+ELASTICITY = 0.3
 #: Level at which a bucket counts as full, so that the price stays a number.
-_FULL = 0.999
+_FULL = 0.9999
 _ROUNDING = 1e-9
 
 
@@ -102,25 +103,26 @@ def affordable(share: float, previous: float, used: Used, changes_per_min: float
 
 
 @kernel
-def _rising(used: float, size: float) -> tuple[float, float]:
+def _rising(used: float, size: float, elasticity: float) -> tuple[float, float]:
     """Level of a bucket, 0..1, and how many times dearer a change is for it: beyond all bounds where none fits in."""
     holds = max(size - THERE_AND_BACK, 1.0)
     level = min(max(used, 0.0) / holds, _FULL)
-    return level, 1.0 + 0.5 * math.pi / (ELASTICITY * holds) * math.tan(0.5 * math.pi * level)
+    return level, 1.0 + 0.5 * math.pi / (elasticity * holds) * math.tan(0.5 * math.pi * level)
 
 
 @kernel
-def price_factor(used: Used, previous: float, changes_per_min: float) -> float:
+def price_factor(used: Used, previous: float, changes_per_min: float, elasticity: float) -> float:
     """How many times the solver's price a change costs, away from the share that is held.
 
-    Whoever is away from the middle has the way back set aside: it costs what the way there did.
+    Whoever is away from the middle has the way back set aside: it costs what the way there did. `elasticity` is what a
+    price that is higher by one in the logarithm takes from the changes, as a part of the budget.
     """
     if changes_per_min <= 0.0:
         return 1.0
     size = buckets(changes_per_min)
     away = changes_counted(0.5 - previous)
-    level, lasting = _rising(used.lasting - away, size.lasting)
-    _, minute = _rising(used.minute - away, size.minute)
+    level, lasting = _rising(used.lasting - away, size.lasting, elasticity)
+    _, minute = _rising(used.minute - away, size.minute, elasticity)
     return math.exp2(level) * lasting * minute
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iwm_power_manager.control.budget import ELASTICITY
 from iwm_power_manager.model.decision import (
     ERROR_ABSOLUTE,
     POWER_ERROR_ROAD,
@@ -35,6 +36,7 @@ class PolicyTable(NamedTuple):
     changes_per_min : budget of changes of the share (`control.budget`); 0 is none
     dearer_cost_j : float64[D, P, V, F, R, S], `expected_cost_j` at the prices `control.budget.DEARER`; D = 0 without a
         budget
+    elasticity : what a price that is higher by one in the logarithm takes from the changes, as a part of the budget
     """
 
     power_w: NDArray[np.float64]
@@ -53,6 +55,7 @@ class PolicyTable(NamedTuple):
     schedule: NDArray[np.float64]
     changes_per_min: float
     dearer_cost_j: NDArray[np.float64]
+    elasticity: float
 
 
 def empty_table(
@@ -87,6 +90,7 @@ def empty_table(
         schedule=as_vector(schedule, 1),
         changes_per_min=0.0,
         dearer_cost_j=np.zeros((0, 1, 1, 1, 1, 1)),
+        elasticity=ELASTICITY,
     )
 
 

@@ -18,13 +18,13 @@ step: a car that never needs its budget is not to change for nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iwm_power_manager.control.budget import changes_counted
+from iwm_power_manager.control.budget import DEARER, ELASTICITY, changes_counted
 from iwm_power_manager.mdp.policy_iteration import Solution, solve
 from iwm_power_manager.mdp.problem import price_matrix
 from iwm_power_manager.mdp.sweep import GATED, Model, flow
@@ -36,6 +36,8 @@ _STILL = 3e-5
 _MOST_STEPS = 3000
 _MOST_TRIALS = 14
 _FIRST_FACTOR = 4.0
+#: Where prices tried say less or more than this, the rate jumps between them.
+_ELASTICITY_RANGE = (0.1, 1.0)
 
 
 class Trial(NamedTuple):
@@ -51,6 +53,26 @@ class Found(NamedTuple):
     price_j: float
     solution: Solution
     trials: tuple[Trial, ...]
+
+
+def elasticity_of(trials: Sequence[Trial], price_j: float, changes_per_min: float) -> float:
+    """What a price that is higher by one in the logarithm takes from the changes, as a part of the budget.
+
+    The mean from the price to the first of `DEARER`, linear in the logarithm between the trials around.
+
+    Parameters
+    ----------
+    trials : in any order; where none is dearer than the price, `control.budget.ELASTICITY` stands
+    price_j : the multiplier, J for a whole change
+    changes_per_min : the budget
+    """
+    dearest_j = max((trial.price_j for trial in trials), default=0.0)
+    if changes_per_min <= 0.0 or dearest_j <= price_j:
+        return ELASTICITY
+    tried_j, rates = np.array(sorted(trials)).T
+    dearer_j = min(DEARER[0] * price_j, dearest_j)
+    first, last = np.interp(np.log([price_j, dearer_j]), np.log(tried_j), rates)
+    return float(np.clip((first - last) / (changes_per_min * math.log(dearer_j / price_j)), *_ELASTICITY_RANGE))
 
 
 def counted(share: NDArray[np.float64]) -> NDArray[np.float64]:

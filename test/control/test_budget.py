@@ -56,14 +56,17 @@ def test_a_minute_may_have_28_changes_beyond_a_budget_of_8():
     assert budget.buckets(0.1) == (2.0, 2.0)
 
 
+ELASTICITY = st.floats(0.1, 1.0)
 USED = st.builds(budget.Used, st.floats(0.0, 600.0), st.floats(0.0, 200.0))
 
 
-@given(USED, USED, SHARE, RATE)
-def test_the_price_never_falls_with_what_is_used(one, other, share, rate):
+@given(USED, USED, SHARE, RATE, ELASTICITY)
+def test_the_price_never_falls_with_what_is_used(one, other, share, rate, elasticity):
     both = budget.Used(max(one.lasting, other.lasting), max(one.minute, other.minute))
-    assert 1.0 <= budget.price_factor(one, share, rate) <= budget.price_factor(both, share, rate) < 1e8
-    assert budget.price_factor(budget.Used(0.0, 0.0), share, rate) == 1.0
+    low, high = (budget.price_factor(used, share, rate, elasticity) for used in (one, both))
+    assert 1.0 <= low <= high < 1e11
+    assert budget.price_factor(budget.Used(0.0, 0.0), share, rate, elasticity) == 1.0
+    assert low <= budget.price_factor(one, share, rate, 0.5 * elasticity), "fewer changes go for a price: it rises more"
 
 
 @given(st.floats(0.0, 1.5), st.floats(2.5, 100.0))
@@ -71,7 +74,7 @@ def test_where_no_change_fits_the_price_has_risen_beyond_what_one_is_worth(more,
     """What comes first never gets the room that something of ten times its worth would have needed."""
     size = budget.buckets(rate)
     for used in (budget.Used(size.lasting - 2.0 + more, 0.0), budget.Used(0.0, size.minute - 2.0 + more)):
-        assert budget.price_factor(used, 0.5, rate) > 10.0
+        assert budget.price_factor(used, 0.5, rate, 1.0) > 10.0
         assert more < 1e-6 or not budget.affordable(1.0, 0.5, used, rate)
 
 
@@ -79,20 +82,21 @@ def test_where_no_change_fits_the_price_has_risen_beyond_what_one_is_worth(more,
 def test_the_way_back_to_the_middle_costs_what_the_way_there_did(used, share, rate):
     """A share whose room for the return is set aside is never held because a bucket is full."""
     there = budget.spent(used, share - 0.5)
-    assert budget.price_factor(there, share, rate) == pytest.approx(budget.price_factor(used, 0.5, rate), rel=1e-6)
+    here = budget.price_factor(used, 0.5, rate, 0.3)
+    assert budget.price_factor(there, share, rate, 0.3) == pytest.approx(here, rel=1e-6)
 
 
-@pytest.mark.parametrize("rate", [1.0, 8.0, 30.0])
-def test_a_bucket_costs_what_the_solution_of_its_hamilton_jacobi_bellman_equation_says(rate):
+@pytest.mark.parametrize(("rate", "elasticity"), [(1.0, 0.3), (8.0, 0.1), (8.0, 0.4), (30.0, 1.0)])
+def test_a_bucket_costs_what_the_solution_of_its_hamilton_jacobi_bellman_equation_says(rate, elasticity):
     """w' = e w^2 + c from nothing at the empty bucket to no bound where a change and the way back fill it."""
     size = budget.buckets(rate)
     for bucket, other in (("minute", 0.0), ("lasting", 1.0)):
         holds = max(getattr(size, bucket) - 2.0, 1.0)
-        steep = np.pi / (2.0 * holds * budget.ELASTICITY)
+        steep = np.pi / (2.0 * holds * elasticity)
         for level in (0.0, 0.25, 0.5, 0.75, 0.9):
             used = budget.Used(0.0, 0.0)._replace(**{bucket: level * holds})
             expected = (1.0 + steep * np.tan(0.5 * np.pi * level)) * 2.0 ** (level * other)
-            assert budget.price_factor(used, 0.5, rate) == pytest.approx(expected)
+            assert budget.price_factor(used, 0.5, rate, elasticity) == pytest.approx(expected)
 
 
 def test_between_the_tabulated_prices_the_logarithm_counts_and_beyond_them_the_last():
@@ -103,4 +107,4 @@ def test_between_the_tabulated_prices_the_logarithm_counts_and_beyond_them_the_l
 
 def test_without_a_budget_nothing_is_counted():
     assert budget.affordable(1.0, 0.0, budget.Used(1e9, 1e9), 0.0)
-    assert budget.price_factor(budget.Used(1e9, 1e9), 0.5, 0.0) == 1.0
+    assert budget.price_factor(budget.Used(1e9, 1e9), 0.5, 0.0, 0.3) == 1.0

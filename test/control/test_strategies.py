@@ -104,7 +104,7 @@ def within_rounding(costs, ours, slack):
     return costs[ours] <= min(costs.values()) + slack
 
 
-def it_changes_where_it_pays(worth_j, at, table):
+def it_changes_where_it_pays(worth_j, at, table, car=CAR):
     """The only other share there is, at a price a little below what the change is worth, and not a little above it."""
     previous, (other,) = at.previous_share, table.share
     pays = worth_j / splits.price_units(other - previous)
@@ -112,7 +112,7 @@ def it_changes_where_it_pays(worth_j, at, table):
 
     def share(price):
         chosen = table._replace(switching_cost_j=price)
-        return STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), CAR, chosen)
+        return STRATEGIES["sdp_lookahead"].choose(at, default_settings("sdp_lookahead"), car, chosen)
 
     assert share(max(pays * (1.0 + 1e-6), 0.0)) == previous
     assert share(max(pays * (1.0 - 1e-6), 0.0)) == (other if pays > 0.0 else previous)
@@ -302,12 +302,17 @@ def test_a_share_is_judged_by_the_mean_over_noise_and_the_step_counts_while_the_
 @given(
     st.lists(st.floats(500.0, 20e3), min_size=4, max_size=4),
     st.floats(5.0, 30.0),
-    st.sampled_from([(0.5, 1.0), (0.5, 0.0), (0.75, 1.0), (1.0, 0.5), (0.0, 0.5), (1.0, 0.75)]),
+    st.sampled_from([(0.5, 1.0), (0.5, 0.0), (0.75, 1.0), (1.0, 0.5), (0.0, 0.5), (1.0, 0.75), (1.0, 0.25)]),
+    st.sampled_from([1.0, 2.0]),
 )
-def test_with_a_budget_a_change_away_from_the_middle_has_to_be_worth_more_than_the_mean_over_noise_is_uncertain(
-    demands, speed, shares
+def test_with_a_budget_a_change_away_from_equal_load_has_to_be_worth_more_than_the_mean_over_noise_is_uncertain(
+    demands, speed, shares, stronger
 ):
+    """`stronger` is how many times the rear motors' torque the front ones have: equal load is at 0.5, or at 2/3."""
     gain, (previous, other) = 0.5, shares
+    motor = CAR.front.motor._replace(peak_torque_nm=stronger * CAR.rear.motor.peak_torque_nm)
+    car = CAR._replace(front=CAR.front._replace(motor=motor))
+    balanced = stronger / (stronger + 1.0)
     jitter = no_jitter()._replace(samples_w=(*demands[1:], *(0.0,) * 7), taken=3, gain=gain)
     at = situation(demands[0], speed, previous=previous)._replace(jitter=jitter)
     problem = TABLE.problem._replace(dt_s=0.2)
@@ -316,17 +321,17 @@ def test_with_a_budget_a_change_away_from_the_middle_has_to_be_worth_more_than_t
     weights /= weights.sum()
 
     def settled_j(power, share):
-        return step_cost_and_next(power, speed, 0.0, 0.0, share, CAR, problem).cost_j
+        return step_cost_and_next(power, speed, 0.0, 0.0, share, car, problem).cost_j
 
-    step_j = splits.lagging(demands, weights, speed, settled_j, problem, CAR)
+    step_j = splits.lagging(demands, weights, speed, settled_j, problem, car)
     saved = np.array([settled_j(power, previous) - settled_j(power, other) for power in demands])
     chance = math.sqrt(np.average((saved - weights @ saved) ** 2, weights=weights) * (weights @ weights))
     mean = weights @ [step_j(power, previous) - step_j(power, other) for power in demands]
-    if abs(other - 0.5) < abs(previous - 0.5):
+    if previous <= other <= balanced or balanced <= other <= previous:
         chance = 0.0
     # Two samples more at this gain: 0.2 s; and 0.8 s of which half count, for the forecast that does not.
     worth = (0.5 + (0.5 * 0.8 + 0.2) / 0.2) * (mean - chance) - splits.TELLS_APART_W * 0.2
-    it_changes_where_it_pays(worth, at, table)
+    it_changes_where_it_pays(worth, at, table, car)
 
 
 @given(
@@ -479,8 +484,8 @@ def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_
     for prices_at in (lasting, minute):
         assert free > prices_at[0] > prices_at[1] > prices_at[2] > prices_at[3] == 0.0
     # Half of what a bucket of five minutes' budget holds: hardly dearer.
-    assert free / lasting[1] == pytest.approx(2.0**0.5 * (1.0 + np.pi / (0.7 * 38.0)), rel=0.05)
-    assert free / minute[1] == pytest.approx(1.0 + np.pi / (0.7 * 18.0), rel=0.05)
+    assert free / lasting[1] == pytest.approx(2.0**0.5 * (1.0 + np.pi / (2.0 * BUDGETED.elasticity * 38.0)), rel=0.05)
+    assert free / minute[1] == pytest.approx(1.0 + np.pi / (2.0 * BUDGETED.elasticity * 18.0), rel=0.05)
 
 
 def test_the_way_back_to_the_middle_gets_dearer_by_what_was_used_before_the_way_there():
@@ -496,7 +501,7 @@ def test_the_way_back_to_the_middle_gets_dearer_by_what_was_used_before_the_way_
             (p for p in prices if lookahead_share(*state, table._replace(switching_cost_j=p)) != 1.0), default=0.0
         )
 
-    assert dearest(1.0) / dearest(10.0) == pytest.approx(1.0 + np.pi / (0.7 * 18.0), rel=0.05)
+    assert dearest(1.0) / dearest(10.0) == pytest.approx(1.0 + np.pi / (2.0 * BUDGETED.elasticity * 18.0), rel=0.05)
 
 
 def test_no_load_is_moved_off_an_axle_for_slip_that_a_jitter_does_not_reach():

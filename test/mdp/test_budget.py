@@ -8,7 +8,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from iwm_power_manager.mdp.budget import Occupancy, find_price
+from iwm_power_manager.control.budget import ELASTICITY
+from iwm_power_manager.mdp.budget import Occupancy, Trial, elasticity_of, find_price
 from iwm_power_manager.mdp.demand import Source, chain_of
 from iwm_power_manager.mdp.policy_iteration import solve
 from iwm_power_manager.mdp.problem import load_problem, price_matrix
@@ -67,6 +68,27 @@ def test_the_price_found_keeps_the_budget_and_a_smaller_budget_is_dearer(model):
         below = [t.price_j for t in result.trials if t.changes_per_min > rate]
         above = [t.price_j for t in result.trials if t.changes_per_min <= rate]
         assert trial.changes_per_min == pytest.approx(rate, rel=0.031) or min(above) / max(below) < 1.02
+
+
+@pytest.mark.parametrize("elasticity", [0.12, 0.3, 0.9])
+@pytest.mark.parametrize("dearest", [2.0, 3.0, 12.0])
+def test_what_prices_do_to_the_changes_is_told_by_those_that_were_tried(elasticity, dearest):
+    def trial(times):
+        return Trial(20.0 * times, 8.0 * (1.0 - elasticity * np.log(times)))
+
+    tried = [trial(dearest), trial(0.25), trial(1.0), Trial(400.0, 0.0)][: 4 if dearest > 3.0 else 3]
+    assert elasticity_of(tried, 20.0, 8.0) == pytest.approx(elasticity)
+    # What lies beyond the first of the dearer prices does not count.
+    beyond = [trial(1.0), trial(3.0), Trial(61.0, 0.0)]
+    assert elasticity_of(beyond, 20.0, 8.0) == pytest.approx(elasticity)
+
+
+def test_where_no_dearer_price_was_tried_or_the_rate_jumps_the_elasticity_stays_a_sane_number():
+    assert elasticity_of([], 20.0, 8.0) == ELASTICITY
+    assert elasticity_of([Trial(20.0, 8.0), Trial(5.0, 12.0)], 20.0, 8.0) == ELASTICITY
+    assert elasticity_of([Trial(20.0, 8.0), Trial(80.0, 1.0)], 20.0, 0.0) == ELASTICITY
+    assert elasticity_of([Trial(20.0, 8.0), Trial(80.0, 8.0)], 20.0, 8.0) == 0.1
+    assert elasticity_of([Trial(20.0, 8.0), Trial(20.2, 1.0)], 20.0, 8.0) == 1.0
 
 
 def test_the_rate_is_that_of_a_simulated_drive(model):

@@ -148,10 +148,10 @@ def bellman(point, previous, table, outcome, used=(0.0, 0.0), steps=1.0, motors_
         holds = [max(size - 2.0, 1.0) for size in full]
         # The way back is set aside, and costs what the way there did.
         away = min(abs(0.5 - previous) / 0.25, 1.0)
-        levels = [min(max(of - away, 0.0) / size, 0.999) for of, size in zip(used, holds, strict=True)]
+        levels = [min(max(of - away, 0.0) / size, 0.9999) for of, size in zip(used, holds, strict=True)]
         factor = 2.0 ** levels[0]
         for level, size in zip(levels, holds, strict=True):
-            factor *= 1.0 + math.pi / (0.7 * size) * math.tan(math.pi / 2.0 * level)
+            factor *= 1.0 + math.pi / (2.0 * table.elasticity * size) * math.tan(math.pi / 2.0 * level)
         level = min(math.log(factor, 3.0), 2.0)
     costs, wholes = {}, {}
     for share in (previous, *table.share):

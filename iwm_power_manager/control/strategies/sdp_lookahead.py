@@ -163,15 +163,23 @@ class _Outlook(NamedTuple):
 
 
 @kernel
+def _balanced(vehicle: VehicleParams) -> float:
+    """Share at which front and rear motors are loaded alike: 0.5 where they are equal."""
+    front, rear = vehicle.front, vehicle.rear
+    force = front.motor.peak_torque_nm / front.wheel.radius_m
+    return force / (force + rear.motor.peak_torque_nm / rear.wheel.radius_m)
+
+
+@kernel
 def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, policy: PolicyTable) -> float:
     """Share that minimises eq. 31, as far as it is believed, among those whose change the budget can afford."""
     previous = situation.previous_share
     used = situation.changes_used
-    factor = price_factor(used, previous, policy.changes_per_min)
+    factor = price_factor(used, previous, policy.changes_per_min, policy.elasticity)
     level = price_level(factor) if policy.dearer_cost_j.shape[0] > 0 else 0.0
     price = factor * policy.switching_cost_j
     budgeted = policy.changes_per_min > 0.0
-    unequal = abs(previous - 0.5)
+    balanced = _balanced(vehicle)
     demand_w = situation.power_demand_w
     gain = situation.jitter.gain
     half = _half_believed(demand_w, situation, vehicle, policy)
@@ -215,7 +223,7 @@ def choose(situation: Situation, settings: Settings, vehicle: VehicleParams, pol
             if steady and step > 0.0:
                 worth = max(worth, step + min(later, earlier))
             worth -= switching
-            if budgeted and abs(share - 0.5) > unequal:
+            if budgeted and (share - previous) * (share - balanced) > 0.0:
                 worth -= steps * found.doubt_j
             if worth + _ROUNDING * abs(kept.step_j) <= most:
                 break
