@@ -69,7 +69,7 @@ def draw_margins(frontiers: Sequence[Frontier], path: Path) -> None:
     axis.axhline(-0.005, color=COLOURS[6], linewidth=0.8)
     axis.set_yscale("symlog", linthresh=0.02)
     axis.set_xlabel("cells, %")
-    axis.set_ylabel("saving minus the best rival's with no more changes, points")
+    axis.set_ylabel("margin against the best rival\nwith no more changes, points")
     axis.legend(frameon=False)
     axis.grid(alpha=0.3)
     write_picture(path, figure)
