@@ -82,10 +82,12 @@ def solve_one(
     path: Path,
     update: Callable[[Iteration], None] = lambda _: None,
     verify: bool = False,
+    trials: Sequence[Trial] = (),
 ) -> Solved:
     """Solve for one road, write the policy, and say what it took; `update` hears of every iteration.
 
-    With `verify`, the Bellman residual of what is stored is computed from the problem alone and stored, too.
+    With `verify`, the Bellman residual of what is stored is computed from the problem alone and stored, too. `trials`
+    are those of the search that gave the problem its price of a change, if it has one.
     """
     started = time.perf_counter()
     problem = problem.on_road(friction)
@@ -94,7 +96,6 @@ def solve_one(
     # What rounding the stored cost-to-go adds is part of the promise.
     tolerance = problem.tolerance_j - cost_quantum_j(problem.tolerance_j) / 2.0
     start = None
-    trials: tuple[Trial, ...] = ()
     if problem.changes_per_min > 0.0 and problem.switching_cost_j == 0.0:
         found = find_price(
             model, problem.share, problem.dt_s, problem.changes_per_min, SEARCH_TOLERANCE * problem.tolerance_j

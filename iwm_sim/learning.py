@@ -29,6 +29,7 @@ from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import PolicyTable, empty_table
 from iwm_power_manager.cycle import Cycle, longest_gap, make_cycle
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.mdp.budget import Trial
 from iwm_power_manager.mdp.demand import Source, chain_of
 from iwm_power_manager.mdp.problem import Problem
 from iwm_power_manager.policy import Policy, load_policy
@@ -94,7 +95,7 @@ class Outcome(NamedTuple):
 
 
 class Task(NamedTuple):
-    """All that is needed to solve and drive a candidate."""
+    """All that is needed to solve and drive a candidate; `trials` are those of the search for its price of a change."""
 
     problem: Problem
     vehicle: Vehicle
@@ -103,6 +104,7 @@ class Task(NamedTuple):
     general: tuple[Source, ...]
     drives: tuple[Cycle, ...]
     folder: str
+    trials: tuple[Trial, ...] = ()
 
 
 def recorded_cycle(name: str, drive: RecordedDrive) -> Cycle:
@@ -157,7 +159,7 @@ def try_candidate(candidate: Candidate, task: Task) -> Outcome:
     sources = sources_at(candidate.weight, task.recorded, task.general)
     chain = chain_of(problem, sources)
     path = policy_path(task.folder, candidate)
-    solved = solve_one(problem, task.vehicle, task.friction, chain, sources, path)
+    solved = solve_one(problem, task.vehicle, task.friction, chain, sources, path, trials=task.trials)
     return drive_all(candidate, "sdp_lookahead", solved.policy.table(), task)
 
 
@@ -194,7 +196,7 @@ def at_one_price(task: Task) -> Task:
     if problem.changes_per_min > 0.0 and problem.switching_cost_j == 0.0:
         path = Path(task.folder) / "price.npz"
         solved = solve_one(problem, task.vehicle, task.friction, chain_of(problem, task.general), task.general, path)
-        problem = solved.policy.problem
+        return task._replace(problem=solved.policy.problem, trials=solved.policy.trials)
     return task._replace(problem=problem)
 
 
