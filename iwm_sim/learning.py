@@ -190,14 +190,11 @@ def moves_j(moves: NDArray[np.float64], table: PolicyTable) -> float:
     return float(table.switching_cost_j * np.abs(moves).sum() + table.switching_fixed_cost_j * np.count_nonzero(moves))
 
 
-def at_one_price(task: Task) -> Task:
-    """The task with the price of a change that its cycles alone need for the budget, for all candidates alike."""
-    problem = task.problem.on_road(task.friction)
-    if problem.changes_per_min > 0.0 and problem.switching_cost_j == 0.0:
-        path = Path(task.folder) / "price.npz"
-        solved = solve_one(problem, task.vehicle, task.friction, chain_of(problem, task.general), task.general, path)
-        return task._replace(problem=solved.policy.problem, trials=solved.policy.trials)
-    return task._replace(problem=problem)
+def solve_cycles_alone(task: Task) -> tuple[Task, Policy]:
+    """The task with the price of a change that the cycles alone need, for all candidates, and the policy of these."""
+    path, chain = policy_path(task.folder, BASELINE), chain_of(task.problem, task.general)
+    policy = solve_one(task.problem, task.vehicle, task.friction, chain, task.general, path).policy
+    return task._replace(problem=policy.problem, trials=policy.trials), policy
 
 
 def choose(outcomes: Sequence[Outcome]) -> Outcome:
@@ -242,10 +239,10 @@ def learn(
     task: Task, candidates: Sequence[Candidate], jobs: int, done: Callable[[Outcome], None] = lambda _: None
 ) -> Learned:
     """Try candidates, the baseline first, on one road; `done` hears of each."""
-    task = at_one_price(task)
+    # In this process: what it compiles, the others find in the cache.
+    task, cycles_alone = solve_cycles_alone(task)
     equal = drive_all(_NOT_SOLVED, "equal", empty_table(), task)
-    # The first one in this process: what it compiles, the others find in the cache.
-    outcomes = [try_candidate(candidates[0], task)]
+    outcomes = [drive_all(BASELINE, "sdp_lookahead", cycles_alone.table(), task)]
     done(outcomes[0])
     outcomes += on_all_cores(partial(try_candidate, task=task), candidates[1:], jobs, done)
     chosen = choose(outcomes)
