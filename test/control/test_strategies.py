@@ -57,7 +57,9 @@ TABLE = _solved()
 ONE_SHARE = _solved((0.0,))
 #: The same with a budget of changes, and what follows at dearer prices.
 BUDGETED = TABLE._replace(
-    changes_per_min=8.0, dearer_cost_j=np.stack([TABLE.expected_cost_j * 1.5, TABLE.expected_cost_j[::-1] * 2.0])
+    changes_per_min=8.0,
+    dearer_cost_j=np.stack([TABLE.expected_cost_j * 1.5, TABLE.expected_cost_j[::-1] * 2.0]),
+    elasticity=0.2,
 )
 AXES = ("power_w", "speed_mps", "slip_front", "slip_rear", "previous_share")
 POWER = st.one_of(st.floats(2.0, 30e3), st.floats(-40e3, -2.0))

@@ -16,7 +16,7 @@ import yaml
 from bags_helpers import write_drive
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
-from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.cycle import load_cycle, make_cycle
 from iwm_power_manager.errors import ConfigError
 from iwm_power_manager.exit_codes import BAD_INPUT, DONE
 from iwm_power_manager.mdp.demand import Source
@@ -198,6 +198,23 @@ def test_what_nycc_taught_drives_nycc_no_worse_than_what_three_cycles_taught(tmp
     assert policy.checksum == road["checksum"]
     # All candidates pay what keeps the cycles' policy within its budget.
     assert policy.problem.switching_cost_j == load_policy(general).problem.switching_cost_j
+
+
+def test_every_candidate_pays_what_keeps_the_cycles_policy_within_its_budget(tmp_path: Path) -> None:
+    car = load_vehicle(share_path(f"config/vehicles/{CAR}.yaml"))
+    axes = {"power_w": np.arange(-12e3, 21e3, 4e3), "speed_mps": np.arange(0.0, 31.0, 5.0), "share": np.arange(5) / 4.0}
+    grid = load_problem(share_path("config/grids/coupled.yaml")).for_car(car.params)
+    problem = dataclasses.replace(grid, **axes, demand_by_speed=False)
+    cycle = make_cycle("hill", np.arange(0.0, 41.0, 10.0), np.array([0.0, 8.0, 12.0, 6.0, 0.0]))
+    general = Source("cycle", "", 1.0, (np.array([0.0, 8e3, 4e3, -4e3] * 50),))
+    recorded = Source("bag", "", 1.0, (np.array([0.0, 4e3, 0.0, -8e3] * 50),))
+    task = learning.Task(problem, car, 0.9, (recorded,), (general,), (cycle,), str(tmp_path))
+    task, cycles_alone = learning.solve_cycles_alone(task)
+    learning.try_candidate(Candidate(RECORDING_ALONE, 1.0), task)
+    found = load_policy(learning.policy_path(str(tmp_path), Candidate(RECORDING_ALONE, 1.0)))
+    assert found.problem.switching_cost_j == cycles_alone.problem.switching_cost_j > 0.0
+    assert found.trials == cycles_alone.trials and len(found.trials) > 1
+    assert found.checksum != cycles_alone.checksum
 
 
 @pytest.mark.nightly
