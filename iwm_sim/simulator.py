@@ -152,7 +152,10 @@ class Simulator(Node):
         speed_factor: float = values["speed_factor"]
         self._period_ns = round(1e9 / values["rate_hz"])
         period_s = self._period_ns / 1e9
-        self._drive = Drive(_scenario(values), dt_s=period_s)
+        scenario = _scenario(values)
+        if scenario.cycle and scenario.cycle.gap:
+            self.get_logger().warning(scenario.cycle.gap)
+        self._drive = Drive(scenario, dt_s=period_s)
         self._pedal_steps = max(1, round(values["rate_hz"] / values["pedal_rate_hz"]))
         self._exchange = Exchange(values["resend_after_s"], values["answer_timeout_s"])
         self._pacer = Pacer(period_s, speed_factor)

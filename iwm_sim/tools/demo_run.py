@@ -60,6 +60,8 @@ def run_scenario(plan: Plan) -> tuple[int, dict[str, Any]]:
     scenario = load_scenario(plan.scenario, plan.idle_drive or None)
     plan = dataclasses.replace(plan, vehicle=str(scenario.vehicle.path), friction=scenario.assumed_friction)
     load(plan)
+    if scenario.cycle and scenario.cycle.gap:
+        print(f"demo: warning: {scenario.cycle.gap}", file=sys.stderr)
     make_folder(make_folder(plan.output, new=True) / "log")
     print(f"{scenario.name}: {scenario.about}")
     compile_for_a_drive()

@@ -297,6 +297,7 @@ def _scenario(options: argparse.Namespace) -> None:
     for strategy in strategies:
         if strategy not in drivable():
             raise ConfigError("arguments", "--strategy", f"{strategy} drives no scenario", ", ".join(drivable()))
+    _tell_doubts([f"warning: {scenario.cycle.gap}" for scenario in scenarios if scenario.cycle and scenario.cycle.gap])
     rows = []
     for scenario in scenarios:
         for strategy in strategies:

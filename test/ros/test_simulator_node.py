@@ -336,6 +336,18 @@ def test_what_it_cannot_work_with_gives_one_line(capfd, monkeypatch, parameters,
     assert expected in lines[0]
 
 
+@pytest.mark.parametrize("given_by", ["cycle_file", "scenario_file"])
+def test_a_gap_in_the_cycle_is_said(given_by, tmp_path, capfd, monkeypatch) -> None:
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    cycle, road = tmp_path / "tunnel.csv", tmp_path / "tunnel.yaml"
+    cycle.write_text("time_s,speed_mps\n0,9\n1,10\n2,10\n62,10\n63,9\n64,9\n")
+    road.write_text(f"format: 1\nabout: A tunnel.\ncycle: {cycle}\nroad: {{friction: 0.9}}\n")
+    given = {given_by: {"cycle_file": cycle, "scenario_file": road}[given_by], "partner_timeout_s": 0.2}
+    assert simulator.main(["simulator", *arguments(given, {"__ns": f"/gap_{os.getpid()}"})]) == FAILED
+    output = capfd.readouterr()
+    assert f"{cycle}: line 5: is 60 s after the one before" in output.out + output.err
+
+
 def test_a_parameter_that_does_not_exist_is_refused(capfd, monkeypatch) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)
     given = arguments({"cycle": "udds"}, {"__ns": f"/alone_{os.getpid()}"})

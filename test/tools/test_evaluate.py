@@ -85,6 +85,14 @@ def test_a_gap_in_a_cycle_is_said_whatever_is_printed(mode, tmp_path, capsys):
     assert f"warning: {cycle}: line 5: is 60 s after the one before" in capsys.readouterr().err
 
 
+def test_a_gap_in_a_scenarios_cycle_is_said(tmp_path, capsys):
+    cycle, road = tmp_path / "tunnel.csv", tmp_path / "tunnel.yaml"
+    cycle.write_text("time_s,speed_mps\n0,9\n1,10\n2,10\n62,10\n63,9\n64,9\n")
+    road.write_text(f"format: 1\nabout: A tunnel.\ncycle: {cycle}\nroad: {{friction: 0.9}}\nuntil: {{time_s: 1}}\n")
+    assert evaluate.main(["--scenario", str(road), "--strategy", "equal", "--json", "-"]) == 0
+    assert f"warning: {cycle}: line 5: is 60 s after the one before" in capsys.readouterr().err
+
+
 def test_law_settings_reach_the_law(hill, tmp_path):
     out = tmp_path / "out.json"
     law = ["--gate-mode", "table2", "--no-gate-driving", "--switching-power", "5", "--critical-slip", "0.1"]
