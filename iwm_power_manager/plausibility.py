@@ -38,6 +38,8 @@ _ONE_MOTOR = "of one motor is meant"
 _LIMIT = "of the power of all motors"
 _VOLTAGE = "of what the discharge limit allows at most (Voc^2 / 4 P)"
 _PLANT = "of resistance_ohm, together with polarisation_resistance_ohm"
+#: Rolling resistance of tyres on firm roads, from a solar racer's to gravel; 0 may be meant.
+_ROLLING = (0.002, 0.04)
 #: In the order of `_motor_values` and `_battery_values`.
 _MOTOR = (
     _Bound("max_power_w", "W per kg of car and motor", 0.5, 1000.0, _KILOWATTS, f"the power {_ONE_MOTOR}"),
@@ -118,6 +120,15 @@ def check_car(path: Path, params: VehicleParams, key_of: Callable[[str, str], st
     _check(path, f"chassis.{_AIR.key}", _AIR, params.chassis.air_density_kgpm3 or _AIR.high)  # a vacuum may be meant
     for bound, value in zip(_BATTERY, _battery_values(params), strict=True):
         _check(path, f"battery.{bound.key}", bound, value)
+
+
+def unusual(params: VehicleParams) -> list[str]:
+    """What a car may have, but seldom has: lines for the reader."""
+    rolling, (low, high) = params.chassis.rolling_resistance, _ROLLING
+    if rolling == 0.0 or low <= rolling <= high:
+        return []
+    usual = f"tyres on firm roads have {low:g} to {high:g}; is it a fraction of the weight, not percent or kg/t?"
+    return [f"chassis.rolling_resistance: {rolling:g} is unusual: {usual}"]
 
 
 def _check(path: Path, key: str, bound: _Bound, value: float) -> None:

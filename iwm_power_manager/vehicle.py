@@ -118,6 +118,7 @@ def load_vehicle(path: Path | str, idle_drive: str | None = None) -> Vehicle:
     )
     _check_tips_over(path, params.chassis)
     plausibility.check_car(path, params, lambda axle, part: f"{axle}.{part}" if part in content.get(axle, {}) else part)
+    notes += tuple(f"{path}: {line}" for line in plausibility.unusual(params))
     return Vehicle(name, path, drive, params, _hash(params), notes)
 
 

@@ -480,6 +480,12 @@ def test_numbers_that_do_not_fit_each_other_are_refused_with_the_likely_unit(pat
     assert words in error.problem
 
 
+@pytest.mark.parametrize(("value", "noted"), [(0.1, True), (0.0005, True), (0.04, False), (0.002, False), (0.0, False)])
+def test_a_rolling_resistance_of_no_firm_road_is_noted(value, noted, loaded):
+    notes = loaded(changed(("chassis", "rolling_resistance"), value)).notes
+    assert [f"chassis.rolling_resistance: {value:g} is unusual" in note for note in notes] == [True] * noted
+
+
 def test_a_torque_of_the_motor_s_shaft_without_a_gear_is_noticed(refused):
     content = changed(("motor", "continuous_torque_nm"), 5.0, content=changed(("motor", "peak_torque_nm"), 20.0))
     assert "a torque at the motor's shaft without gear?" in refused(content).problem
