@@ -20,7 +20,13 @@ from iwm_power_manager.trace_units import SPEED_UNITS, TIME_UNITS, FloatArray, i
 #: At a cut, the speed goes from one piece's end to the next one's start at this, m/s2.
 JOINT_MPS2 = 1.0
 _SHORTEST_STEP_S = 1e-4
-_DAY_S = 86_400.0
+_DAY_S, _HOUR_S = 86_400.0, 3600.0
+_SECONDS = r"(?P<s>[0-5][0-9](?:\.[0-9]{1,9})?)"
+#: What `time_unit` calls clocks: hours:minutes[:seconds], and [hours:]minutes:seconds.
+_CLOCKS = {
+    "clock": rf"(?P<h>[0-9]{{1,3}}):(?P<min>[0-5][0-9])(?::{_SECONDS})?",
+    "min:s": rf"(?:(?P<h>[0-9]{{1,3}}):)?(?P<min>[0-9]{{1,3}}):{_SECONDS}",
+}
 #: A log of which more rows than this lie behind others in time was set back, or holds several drives.
 _MOST_BEHIND = 0.1
 #: A log that shows more than this below zero drives backwards, or has another sign.
@@ -111,7 +117,8 @@ def read_log(
     Parameters
     ----------
     time, speed, grade : names of the columns; "" finds them by their names, the last only where that is `grade`
-    time_unit : a unit of `TIME_UNITS`, "clock" (dates or hours:minutes:seconds), or auto
+    time_unit : a unit of `TIME_UNITS`, "clock" (dates, hours:minutes:seconds or hours:minutes), "min:s" (those and
+        minutes:seconds), or auto
     speed_unit : a unit of `SPEED_UNITS`, or auto: by the column's name, else by the accelerations
     separator, decimal : see `tables.read_table`
 
@@ -141,7 +148,9 @@ def read_log(
     if table.decimal == ",":
         said.append("decimal commas")
     values: dict[str, list[float]] = {name: [] for name in columns}
-    clock = time_unit == "clock" or (time_unit == "auto" and _is_clock(table.rows[1:2], columns["time"]))
+    clock = _clock(table, columns["time"]) if time_unit == "auto" else time_unit if time_unit in _CLOCKS else ""
+    if clock == "min:s" and time_unit == "auto":
+        said.append("time in minutes:seconds: guessed; --time-unit clock says hours:minutes")
     left_out = 0
     for line, cells in table.rows[1:]:
         if any(cells[len(header) :]):
@@ -153,7 +162,7 @@ def read_log(
             continue
         for name, text in row.items():
             read = (
-                _clock_s(table, line, text)
+                _clock_s(table, line, text, clock)
                 if name == "time" and clock
                 else table.number(line, text, header[columns[name]])
             )
@@ -166,7 +175,7 @@ def read_log(
     if left_out:
         said.append(f"{left_out} rows without a value left out")
     if arrays["time"].size:
-        rising = _rising(path, arrays["time"], clock, said)
+        rising = _rising(path, arrays["time"], {"clock": _DAY_S, "min:s": _HOUR_S}.get(clock, np.inf), said)
         arrays = {name: x[rising] for name, x in arrays.items()}
     if arrays["time"].size < 2:
         problem = f"has {arrays['time'].size} usable rows: {'; '.join(said)}"
@@ -174,7 +183,7 @@ def read_log(
     if np.max(np.abs(arrays["grade"])) > MAX_GRADE:
         problem = f"{header[columns['grade']]} reaches {np.max(np.abs(arrays['grade'])):g}: percent or degrees?"
         raise ConfigError(path, "", problem, f"rise over run, -{MAX_GRADE:g} to {MAX_GRADE:g}")
-    return _in_si(path, arrays, header, columns, "clock" if clock else time_unit, speed_unit, said)
+    return _in_si(path, arrays, header, columns, clock or time_unit, speed_unit, said)
 
 
 def _with_units(table: Table) -> Table:
@@ -188,12 +197,12 @@ def _with_units(table: Table) -> Table:
     return table._replace(rows=[(line, named + header[len(words) :]), *table.rows[2:]])
 
 
-def _rising(path: Path | str, time: FloatArray, clock: bool, said: list[str]) -> NDArray[np.bool_]:
-    """Which rows have a later time than all before them; a clock that passes midnight goes on (in place)."""
+def _rising(path: Path | str, time: FloatArray, period_s: float, said: list[str]) -> NDArray[np.bool_]:
+    """Which rows have a later time than all before them; a clock that passes midnight or the hour goes on (in place)."""
     back = np.diff(time)
-    if clock and np.max(time) < _DAY_S and np.any(back < -0.5 * _DAY_S):
-        said.append("the clock passes midnight")
-        time[1:] += _DAY_S * np.cumsum(back < -0.5 * _DAY_S)
+    if np.max(time) < period_s < np.inf and np.any(back < -0.5 * period_s):
+        said.append(f"the clock passes {'midnight' if period_s == _DAY_S else 'the hour'}")
+        time[1:] += period_s * np.cumsum(back < -0.5 * period_s)
     before = np.maximum.accumulate(time)[:-1]
     rising: NDArray[np.bool_] = np.concatenate(([True], time[1:] > before))
     behind = np.flatnonzero(time[1:] < before)
@@ -235,16 +244,21 @@ def _cells(table: Table, column: int) -> list[str]:
     return [cells[column] for _, cells in table.rows[1:] if column < len(cells)]
 
 
-def _is_clock(rows: list[tuple[int, list[str]]], column: int) -> bool:
-    return any(column < len(cells) and re.search(r"[0-9]:[0-9]", cells[column]) for _, cells in rows)
+def _clock(table: Table, column: int) -> str:
+    """Which of `_CLOCKS` a column's first cell that says something shows; "" for none."""
+    first = next((cell for cell in _cells(table, column) if not is_nothing(cell)), "")
+    if not re.search(r"[0-9]:[0-9]", first):
+        return ""
+    hours = re.search("h:m", table.rows[0][1][column], re.IGNORECASE)
+    return "min:s" if re.fullmatch("[0-9]+:[0-9.,]+", first) and not hours else "clock"
 
 
-def _clock_s(table: Table, line: int, text: str) -> float:
-    """Seconds of a date with time, or of hours:minutes:seconds."""
+def _clock_s(table: Table, line: int, text: str, clock: str) -> float:
+    """Seconds of a date with time, or of a clock."""
     plain = text.replace(",", ".")
-    parts = re.fullmatch(r"([0-9]{1,3}):([0-9]{2})(?::([0-9]{2}(?:\.[0-9]{1,9})?))?", plain, re.ASCII)
+    parts = re.fullmatch(_CLOCKS[clock], plain, re.ASCII)
     if parts:
-        return 3600.0 * int(parts[1]) + 60.0 * int(parts[2]) + float(parts[3] or 0.0)
+        return sum(TIME_UNITS[unit] * float(value or 0) for unit, value in parts.groupdict().items())
     try:
         moment = datetime.datetime.fromisoformat(plain)
         return (moment.replace(tzinfo=moment.tzinfo or datetime.UTC)).timestamp()
@@ -268,7 +282,7 @@ def _in_si(
     said: list[str],
 ) -> Log:
     time, speed = arrays["time"] - arrays["time"][0], arrays["speed"]
-    units = {"time": "s" if time_unit == "clock" else time_unit, "speed": speed_unit}
+    units = {"time": "s" if time_unit in _CLOCKS else time_unit, "speed": speed_unit}
     for name, names in (("time", _TIME_NAMES), ("speed", _UNIT_NAMES)):
         named = _named(header[columns[name]], names)
         if units[name] == "auto" and named:

@@ -68,9 +68,9 @@ def parser() -> argparse.ArgumentParser:
     )
     table.add_argument(
         "--time-unit",
-        choices=("auto", "clock", *TIME_UNITS),
+        choices=("auto", "clock", "min:s", *TIME_UNITS),
         default="auto",
-        help="clock: dates, or hours:minutes:seconds (default: %(default)s)",
+        help="clock: dates, or hours:minutes[:seconds]; min:s: [hours:]minutes:seconds (default: %(default)s)",
     )
     table.add_argument("--speed-unit", choices=("auto", *SPEED_UNITS), default="auto", help="default: %(default)s")
     drive = result.add_argument_group("the drive")

@@ -107,6 +107,32 @@ def test_a_column_of_grade_is_taken_and_one_that_looks_like_it_is_said(tmp_path,
         assert load_cycle(tmp_path / "trip.csv").grade.max() == pytest.approx(0.02 if column == "Grade" else 0.0)
 
 
+@pytest.mark.parametrize(
+    ("first", "clock", "words"),
+    [
+        (0, lambda t: f"{t // 60:02d}:{t % 60:02d}", "time in minutes:seconds: guessed; --time-unit clock says"),
+        (0, lambda t: f"{t // 60}:{t % 60:02d}.0", "time in minutes:seconds"),
+        (3540, lambda t: f"{t // 60 % 60:02d}:{t % 60:02d}.0", "the clock passes the hour"),
+        (3540, lambda t: f"{t // 3600}:{t // 60 % 60:02d}:{t % 60:02d}".removeprefix("0:"), "minutes:seconds"),
+    ],
+)
+def test_a_stopwatchs_minutes_and_seconds_are_no_hours_and_minutes(tmp_path, capsys, first, clock, words):
+    clocks = [clock(int(t) + first) for t in NYCC.time_s]
+    log = log_of(tmp_path / "log.csv", ("time", "v [m/s]"), zip(clocks, NYCC.speed_mps, strict=True))
+    code, out, _ = run(capsys, log, "--output", tmp_path / "trip.csv")
+    assert code == 0
+    assert words in out
+    assert np.array_equal(load_cycle(tmp_path / "trip.csv").time_s, NYCC.time_s)
+
+
+@pytest.mark.parametrize(("header", "unit"), [("time (hh:mm)", "auto"), ("time", "clock")])
+def test_hours_and_minutes_are_read_where_they_are_named(tmp_path, capsys, header, unit):
+    log = log_of(tmp_path / "log.csv", (header, "v [m/s]"), [("09:00", 10.0), ("09:01", 12.0), ("09:02", 10.0)])
+    code, _, err = run(capsys, log, "--output", tmp_path / "trip.csv", "--time-unit", unit)
+    assert code == 2
+    assert "the longest of 60 s" in err
+
+
 def test_a_gap_is_bridged_or_cut_by_choice_and_never_in_silence(tmp_path, capsys):
     keep = (NYCC.time_s < 200) | (NYCC.time_s > 250)
     log = log_of(
@@ -248,6 +274,7 @@ def test_a_trace_the_car_cannot_follow_is_warned_of(tmp_path, capsys):
         ("time_s,speed m/s\n0,6\n0.1,0\n0.2,9\n1,9\n", "jumps by 9 m/s from one sample to the next"),
         ("time,speed\n0,0\n1,1e9\n", "look like driving in no unit"),
         ("time clock,speed m/s\n12:00:00,1\nlater,2\n", "'later' is no time"),
+        ("time clock,speed m/s\n12:00:00,1\n12:75:00,2\n", "'12:75:00' is no time"),
         ("time_s,speed m/s\n0," + "1" * 5000 + "\n", "has 5002 characters"),
     ],
 )
