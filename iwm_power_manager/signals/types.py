@@ -39,6 +39,7 @@ _ENCAPSULATION = 4
 _MAX_PADDING = 16
 
 _SEPARATOR = "=" * 80
+_UNION = re.compile(r"\bunion\s+(\w+)\s+switch\b")
 _ENUMERATION = re.compile(r"\benum\s+(\w+)\s*\{[^{}]*\}")
 #: How a text of wide characters may lie in CDR: DDS vendors and versions differ in the width and in what they count.
 _WIDE = ("uint16", "uint32", "uint8")
@@ -192,6 +193,8 @@ def _saying_where(kind: type[IDLParser | MSGParser], text: str) -> Iterator[None
     except Exception as error:
         if not str(error).startswith("Could not parse"):
             raise
+        if union := _UNION.search(text):
+            raise BagError(f"its definition has a union, {union[1]}, and unions are not read") from None
         parser, reached = kind(text), 0
 
         def watched(match: Callable[..., Any]) -> Callable[..., Any]:

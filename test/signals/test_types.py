@@ -105,6 +105,13 @@ def test_the_line_of_an_idl_that_is_wrong_is_named(line: str) -> None:
     assert line in str(caught.value)
 
 
+def test_a_union_is_named_as_what_is_not_read() -> None:
+    union = "union Value switch (long) { case 0: double number; default: long none; };"
+    text = IDL.replace("struct Speed {", f"{union} struct Speed {{ my_msgs::msg::Value extra;")
+    with pytest.raises(BagError, match="type my_msgs/msg/Speed: its definition has a union, Value, and"):
+        types_of("my_msgs/msg/Speed", "ros2idl", text)
+
+
 def test_what_is_no_place_in_a_definition_is_said_as_it_is() -> None:
     with pytest.raises(BagError, match=r"cannot be read: 'Multidimensional arrays are not supported'"):
         types_of("my_msgs/msg/Speed", "ros2idl", IDL.replace("value;", "value[2][3];"))
