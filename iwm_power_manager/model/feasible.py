@@ -14,6 +14,8 @@ _GRAVITY_MPS2 = 9.81
 _WINDOW_S = 1.0
 #: Shares of what a car can do that count as more than it can: a driver gets away with less.
 _MARGIN = 1.02
+#: Few roads are steeper; a grade in percent or degrees is, in the hills, beyond what a cycle may have at all.
+_STEEP = 0.2
 
 FloatArray = NDArray[np.float64]
 
@@ -41,7 +43,7 @@ def _driving_limit_n(axle: Axle, speed_mps: FloatArray) -> FloatArray:
 
 
 def trace_warnings(cycle: Cycle, car: VehicleParams, friction: float) -> list[str]:
-    """What of a trace this car cannot follow on this road, one line for each reason, and whether it looks like km/h.
+    """What of a trace this car cannot follow on this road, one line for each reason, and which unit looks wrong.
 
     Means over a second against the peak torque and power of the motors, the battery's limit without losses, the grip of
     all four tyres, and the friction brakes. Heat, load transfer and slip come on top: a trace without a warning may be
@@ -68,6 +70,10 @@ def trace_warnings(cycle: Cycle, car: VehicleParams, friction: float) -> list[st
                 f"{cycle.name}: asks {needed[at]:.0f} N at {time[at]:.4g} s ({3.6 * speed[at]:.0f} km/h), and "
                 f"{what} {limit[at]:.0f} N; more than they can for {float(np.sum(span[over])):.3g} s in all"
             )
+    steepest = float(np.max(np.abs(cycle.grade)))
+    if steepest > _STEEP:
+        steep = f"grade reaches {steepest:.3g}, a slope of {100.0 * steepest:.3g} %, as few roads have"
+        lines.append(f"{cycle.name}: {steep}: is it in percent or degrees?")
     lively = trace_units.too_lively(cycle.time_s, cycle.speed_mps)
     return [*lines, f"{cycle.name}: {lively}"] if lively else lines
 

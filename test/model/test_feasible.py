@@ -56,6 +56,14 @@ def test_each_limit_is_named_with_its_place():
     assert "the friction brakes give" in line
 
 
+@pytest.mark.parametrize(("grade", "doubted"), [(0.3, True), (-0.3, True), (0.18, False)])
+def test_a_grade_that_few_roads_have_may_be_in_percent(grade, doubted):
+    lines = trace_warnings(make_cycle("hill", [0.0, 10.0, 20.0], [1.0, 1.0, 1.0], [0.0, grade, 0.0]), CAR, 0.9)
+    assert [line.endswith("a slope of 30 %, as few roads have: is it in percent or degrees?") for line in lines] == [
+        True
+    ] * doubted
+
+
 def test_each_axle_counts_with_its_own_motors():
     idle = CAR.rear.motor._replace(max_power_w=1.0, peak_torque_nm=1.0)
     one = CAR._replace(rear=CAR.rear._replace(motor=idle))
