@@ -45,6 +45,7 @@ _TIME_NAMES = {
     "ms": r"\bms\b|_ms|msec|milli",
     "min": r"(?<![a-z])min\b|minutes",
     "h": r"(?<![a-z])h\b|hours",
+    "d": r"\bdays?\b",
     "s": r"\[s\]|\(s\)|_s\b|sec",
 }
 #: Speeds that a log has beside the car's.
@@ -198,7 +199,7 @@ def _with_units(table: Table) -> Table:
 
 
 def _rising(path: Path | str, time: FloatArray, period_s: float, said: list[str]) -> NDArray[np.bool_]:
-    """Which rows have a later time than all before them; a clock that passes midnight or the hour goes on (in place)."""
+    """Which rows have a later time than all before them; a clock that passes its end goes on (in place)."""
     back = np.diff(time)
     if np.max(time) < period_s < np.inf and np.any(back < -0.5 * period_s):
         said.append(f"the clock passes {'midnight' if period_s == _DAY_S else 'the hour'}")
@@ -292,9 +293,11 @@ def _in_si(
             said.append(f"{name} in {units[name]}, as --{name}-unit says, although the column's name says {named}")
     guess = [name for name in units if units[name] == "auto"]
     if guess:
-        known_time = TIME_UNITS.get(units["time"], 1.0) if units["time"] != "auto" else 1.0
-        known_speed = SPEED_UNITS.get(units["speed"], 1.0) if units["speed"] != "auto" else 1.0
-        found = likely_units(time * known_time, np.maximum(speed * known_speed, 0.0))
+        possible = [
+            every if units[name] == "auto" else {units[name]: every[units[name]]}
+            for name, every in (("time", TIME_UNITS), ("speed", SPEED_UNITS))
+        ]
+        found = likely_units(time, np.maximum(speed, 0.0), *possible)
         if found is None:
             look = f"{' and '.join(guess)} look{'s' * (len(guess) == 1)}"
             raise ConfigError(path, "", f"its {look} like driving in no unit", "name the unit")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ FloatArray = NDArray[np.float64]
 
 #: In m/s and in s.
 SPEED_UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "kn": 1852.0 / 3600.0, "cm/s": 0.01, "ft/s": 0.3048}
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 #: Beyond these, m/s2 as the mean of a second, a trace is no car's: a tyre on a dry road gives 1 g and a little more.
 MAX_ACCELERATION_MPS2 = 9.0
@@ -113,10 +114,17 @@ def too_lively(time_s: FloatArray, speed_mps: FloatArray) -> str:
     )
 
 
-def likely_units(time: FloatArray, speed: FloatArray) -> tuple[str, str] | None:
-    """Units of speed and time in which a trace looks like driving; None if there are none."""
-    for time_unit, seconds in TIME_UNITS.items():
-        for speed_unit, metres in SPEED_UNITS.items():
+def likely_units(
+    time: FloatArray,
+    speed: FloatArray,
+    time_units: Mapping[str, float] = TIME_UNITS,
+    speed_units: Mapping[str, float] = SPEED_UNITS,
+) -> tuple[str, str] | None:
+    """Units of speed and time, of these, in which a trace looks like driving; None if there are none."""
+    for time_unit, seconds in time_units.items():
+        if time.size >= _MIN_SAMPLES and (time[-1] - time[0]) * seconds < _WINDOW_S:
+            continue  # no drive, and shorter than what its accelerations are told by
+        for speed_unit, metres in speed_units.items():
             if float(np.max(speed)) * metres > _MAX_SPEED_MPS:
                 continue
             with np.errstate(over="ignore"):

@@ -39,6 +39,7 @@ def run(capsys, *arguments):
         (("Time [ms]", "Speed (mph)"), (1e3, 1 / 0.44704), "speed in mph, as the column's name says"),
         (("stamp_ns", "velocity m/s"), (1e9, 1.0), "time in ns, as the column's name says"),
         (("t", "speed"), (1e3, 1.0), "time in ms: guessed"),
+        (("time", "v [m/s]"), (1.0 / 86400.0, 1.0), "time in d: guessed"),
     ],
 )
 def test_units_are_named_or_guessed_and_the_same_cycle_comes_out(tmp_path, capsys, header, factors, words):
@@ -105,6 +106,13 @@ def test_a_column_of_grade_is_taken_and_one_that_looks_like_it_is_said(tmp_path,
         assert code == 0
         assert words in out
         assert load_cycle(tmp_path / "trip.csv").grade.max() == pytest.approx(0.02 if column == "Grade" else 0.0)
+
+
+def test_two_hundred_samples_in_a_fifth_of_a_second_are_no_drive_of_any_unit(tmp_path, capsys):
+    log = log_of(tmp_path / "log.csv", ("time_ms", "speed"), enumerate(NYCC.speed_mps[30:230]))
+    code, _, err = run(capsys, log, "--output", tmp_path / "trip.csv")
+    assert code == 2
+    assert "its speed looks like driving in no unit; allowed: name the unit" in err
 
 
 @pytest.mark.parametrize(
