@@ -118,8 +118,7 @@ def read_log(
     Parameters
     ----------
     time, speed, grade : names of the columns; "" finds them by their names, the last only where that is `grade`
-    time_unit : a unit of `TIME_UNITS`, "clock" (dates, hours:minutes:seconds or hours:minutes), "min:s" (those and
-        minutes:seconds), or auto
+    time_unit : a unit of `TIME_UNITS`, "clock" (dates or hours:minutes[:seconds]), "min:s" (minutes:seconds), or auto
     speed_unit : a unit of `SPEED_UNITS`, or auto: by the column's name, else by the accelerations
     separator, decimal : see `tables.read_table`
 
@@ -149,9 +148,7 @@ def read_log(
     if table.decimal == ",":
         said.append("decimal commas")
     values: dict[str, list[float]] = {name: [] for name in columns}
-    clock = _clock(table, columns["time"]) if time_unit == "auto" else time_unit if time_unit in _CLOCKS else ""
-    if clock == "min:s" and time_unit == "auto":
-        said.append("time in minutes:seconds: guessed; --time-unit clock says hours:minutes")
+    clock = _clock(table, columns["time"], said) if time_unit == "auto" else time_unit if time_unit in _CLOCKS else ""
     left_out = 0
     for line, cells in table.rows[1:]:
         if any(cells[len(header) :]):
@@ -245,13 +242,15 @@ def _cells(table: Table, column: int) -> list[str]:
     return [cells[column] for _, cells in table.rows[1:] if column < len(cells)]
 
 
-def _clock(table: Table, column: int) -> str:
+def _clock(table: Table, column: int, said: list[str]) -> str:
     """Which of `_CLOCKS` a column's first cell that says something shows; "" for none."""
     first = next((cell for cell in _cells(table, column) if not is_nothing(cell)), "")
     if not re.search(r"[0-9]:[0-9]", first):
         return ""
-    hours = re.search("h:m", table.rows[0][1][column], re.IGNORECASE)
-    return "min:s" if re.fullmatch("[0-9]+:[0-9.,]+", first) and not hours else "clock"
+    if re.search("h:m", table.rows[0][1][column], re.IGNORECASE) or not re.fullmatch("[0-9]+:[0-9.,]+", first):
+        return "clock"
+    said.append("time in minutes:seconds: guessed; --time-unit clock says hours:minutes")
+    return "min:s"
 
 
 def _clock_s(table: Table, line: int, text: str, clock: str) -> float:
