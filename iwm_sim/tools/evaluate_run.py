@@ -326,7 +326,7 @@ def _frontier(options: argparse.Namespace) -> None:
                 place = frontier.Place(f"{vehicle.name} on {cycle.name}", vehicle, cycle, friction)
                 found.append(unseen.budgets_of(place, options.budgets or frontier.BUDGETS_PER_MIN))
                 name = f"{vehicle.name}_{vehicle.idle_drive}_{cycle.name}_{friction_in_name(friction)}"
-                picture = folder / f"{name}.svg"
+                picture = folder / f"{name.replace('/', '_')}.svg"
                 frontier_figure.draw_frontier(found[-1], picture)
                 if not options.quiet:
                     _show_frontier(found[-1], picture)

@@ -13,6 +13,7 @@ import pytest
 
 from iwm_power_manager.control.settings import DEFAULTS
 from iwm_power_manager.policy import load_policy
+from iwm_power_manager.share import share_path
 from iwm_power_manager.tools.command import plain
 from iwm_sim.study import cases, reproduce, single, unseen, variants
 from iwm_sim.study.content import Study
@@ -399,6 +400,18 @@ def test_scenarios_are_driven_with_each_strategy_and_say_what_they_require(tmp_p
 def test_a_strategy_that_knows_the_future_drives_no_scenario(capsys):
     assert evaluate.main(["--scenario", "split_stop", "--strategy", "preview"]) == 2
     assert "preview drives no scenario" in capsys.readouterr().err
+
+
+def test_a_cars_name_leads_no_picture_out_of_its_folder(hill, tmp_path, monkeypatch):
+    car = tmp_path / "car.yaml"
+    text = share_path("config/vehicles/jalalmaab_2015.yaml").read_text()
+    car.write_text(text.replace("name: jalalmaab_2015", "name: ../outside"))
+    monkeypatch.setattr(unseen, "budgets_of", lambda place, *_: Frontier(place.label, "made", (), (), ()))
+    monkeypatch.setattr(evaluate_run.frontier_figure, "draw_frontier", lambda _, path: path.write_text(""))
+    monkeypatch.setattr(evaluate_run, "_show_frontier", lambda *_: None)
+    folder = tmp_path / "frontier"
+    assert evaluate.main(["--frontier", str(folder), "--cycle", str(hill), "--vehicle", str(car)]) == 0
+    assert [path.parent for path in tmp_path.rglob("*.svg")] == [folder]
 
 
 def test_a_frontier_is_printed_drawn_and_written_with_what_it_was_made_with(hill, tmp_path, monkeypatch, capsys):
