@@ -53,6 +53,7 @@ _MOTOR = (
     ),
     _Bound("peak_torque_nm", "g of this axle alone", 0.01, 5.0, _SHAFT, f"the torque {_ONE_MOTOR}"),
     _Bound("regeneration_torque_nm", "of peak_torque_nm", 0.0, 1.5, "", f"the torque {_ONE_MOTOR}"),
+    _Bound("idle_drag_constant_nm", "of peak_torque_nm", 0.0, 0.2, "", "N cm, or the drag of the whole car?"),
     _Bound(
         "loss",
         "efficiency at half of peak torque and full power",
@@ -82,6 +83,14 @@ _AIR = _Bound("air_density_kgpm3", "kg/m3", 0.3, 2.0, "g/cm3 in a kg/m3 field?",
 _BATTERY = (
     _Bound("discharge_limit_w", _LIMIT, 0.05, 100.0, _KILOWATTS, _KILOWATTS),
     _Bound("charge_limit_w", _LIMIT, 0.005, 100.0, _KILOWATTS, _KILOWATTS),
+    _Bound(
+        "nominal_cell_voltage_v",
+        "of the open-circuit voltage at half charge",
+        0.6,
+        1.5,
+        "another cell's?",
+        "another cell's?",
+    ),
     _Bound("cells_in_series", "V of the pack", 5.0, 2000.0, "cells in parallel counted?", "cells in parallel counted?"),
     _Bound("resistance_ohm", _VOLTAGE, 0.0, 1.0, "", "milliohm in an ohm field, or a cell for the pack?"),
     _Bound("ohmic_resistance_ohm", _PLANT, 0.05, 20.0, "a cell for the pack?", "milliohm in an ohm field?"),
@@ -145,6 +154,7 @@ def _motor_values(axle: Axle, mass_kg: float) -> tuple[float, ...]:
         radius * motor.max_power_w / motor.peak_torque_nm,
         2.0 * motor.peak_torque_nm / radius / (mass_kg * _GRAVITY_MPS2),
         motor.regeneration_torque_nm / motor.peak_torque_nm,
+        motor.idle_drag_constant_nm / motor.peak_torque_nm,
         _efficiency(motor),
     )
 
@@ -156,6 +166,7 @@ def _battery_values(params: VehicleParams) -> tuple[float, ...]:
     return (
         battery.discharge_limit_w / power,
         battery.charge_limit_w / power or 1.0,
+        battery.nominal_cell_voltage_v / float(np.interp(0.5, battery.ocv_soc, battery.ocv_cell_v)),
         volt,
         battery.resistance_ohm * 4.0 * battery.discharge_limit_w / volt**2,
         (battery.ohmic_resistance_ohm + battery.polarisation_resistance_ohm) / battery.resistance_ohm,

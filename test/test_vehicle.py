@@ -462,6 +462,18 @@ def test_the_page_has_the_table():
         (("battery", "discharge_limit_w"), 47.5, "battery.discharge_limit_w", "kW in a W field?"),
         (("battery", "charge_limit_w"), 47.5, "battery.charge_limit_w", "kW in a W field?"),
         (("motor", "regeneration_torque_nm"), 800.0, "motor.regeneration_torque_nm", "means 4 of peak_torque_nm"),
+        (
+            ("motor", "idle_drag_constant_nm"),
+            69.0,
+            "motor.idle_drag_constant_nm",
+            "means 0.345 of peak_torque_nm",
+        ),
+        (
+            ("battery", "nominal_cell_voltage_v"),
+            5.5,
+            "battery.nominal_cell_voltage_v",
+            "means 1.67 of the open",
+        ),
         (("wheel", "inertia_kgm2"), 0.0011, "wheel.inertia_kgm2", "g m2, or kg cm2 in a kg m2 field?"),
         (("wheel", "inertia_kgm2"), 110.0, "wheel.inertia_kgm2", "kg cm2 in a kg m2 field"),
         (("chassis", "air_density_kgpm3"), 0.0012, "chassis.air_density_kgpm3", "g/cm3 in a kg/m3 field?"),

@@ -406,9 +406,8 @@ def test_a_cars_name_leads_no_picture_out_of_its_folder(hill, tmp_path, monkeypa
     car = tmp_path / "car.yaml"
     text = share_path("config/vehicles/jalalmaab_2015.yaml").read_text()
     car.write_text(text.replace("name: jalalmaab_2015", "name: ../outside"))
-    monkeypatch.setattr(unseen, "budgets_of", lambda place, *_: Frontier(place.label, "made", (), (), ()))
-    monkeypatch.setattr(evaluate_run.frontier_figure, "draw_frontier", lambda _, path: path.write_text(""))
-    monkeypatch.setattr(evaluate_run, "_show_frontier", lambda *_: None)
+    rival = Point("instantaneous_slip", 60.0, 0.41, 5.5, 6.5, 4.4, 7, True)
+    monkeypatch.setattr(unseen, "budgets_of", lambda place, *_: Frontier(place.label, "made", (rival,), (rival,), ()))
     folder = tmp_path / "frontier"
     assert evaluate.main(["--frontier", str(folder), "--cycle", str(hill), "--vehicle", str(car)]) == 0
     assert [path.parent for path in tmp_path.rglob("*.svg")] == [folder]
