@@ -39,9 +39,13 @@ from iwm_power_manager.errors import BagError, did_you_mean, system_errors
 
 SUFFIXES = (".mcap", ".db3")
 COMPRESSED_SUFFIXES = (".zstd", ".zst", ".lz4")
-#: What has to be unpacked by who packed it: how it begins, and what its name ends with.
-_FOREIGN = {b"\x1f\x8b": "gzip", b"BZh": "bzip2"}
-_FOREIGN_SUFFIXES = (".gz", ".bz2")
+#: What another program has to make readable: how it begins with what to do, and what its name ends with.
+_FOREIGN = {
+    b"\x1f\x8b": "is packed by gzip: unpack it first",
+    b"BZh": "is packed by bzip2: unpack it first",
+    b"#ROSBAG ": "is a bag of ROS 1: rosbags-convert makes one of ROS 2 of it",
+}
+_FOREIGN_ENDINGS = (*(kind + packed for kind in SUFFIXES for packed in (".gz", ".bz2")), ".bag")
 _SQLITE_MAGIC = b"SQLite format 3\0"
 _NEVER = 2**64
 _DIGITS = re.compile(r"\d+")
@@ -292,8 +296,8 @@ def opened_file(path: Path, stack: ExitStack, folder: Path | None = None, beside
     """
     regular_file(path, folder)
     named = path.suffix in COMPRESSED_SUFFIXES
-    if packer := next((name for begin, name in _FOREIGN.items() if _head(path, len(begin)) == begin), ""):
-        raise BagError(f"{path}: is packed by {packer}: unpack it first")
+    if advice := next((words for begin, words in _FOREIGN.items() if _head(path, len(begin)) == begin), ""):
+        raise BagError(f"{path}: {advice}")
     if journals(path):
         return path, "has a journal, which is not read: recorder --recover does that"
     if not named and _head(path, 4) not in PACKED:
@@ -331,7 +335,7 @@ def data_files(folder: Path) -> list[Path]:
     """Data files of a bag's folder in the order of recording: `bag_10.mcap` comes after `bag_9.mcap`."""
     with system_errors(folder, "cannot be read"):
         entries = list(folder.iterdir())
-    packed = [entry for entry in entries if entry.suffix in _FOREIGN_SUFFIXES and entry.stem.endswith(SUFFIXES)]
+    packed = [entry for entry in entries if entry.name.endswith(_FOREIGN_ENDINGS)]
     names = [entry for entry in entries if plain_name(entry).endswith(SUFFIXES)] or packed  # which say what to do
     real = {os.path.realpath(name) for name in names if not name.is_symlink()}
     names = [name for name in names if not (name.is_symlink() and os.path.realpath(name) in real)]  # the same twice

@@ -135,6 +135,15 @@ def test_a_torn_file_of_compressed_messages_keeps_them_and_they_can_be_decoded(t
         assert [data for _, _, data in reader.messages()] == [message.data for message in before]
 
 
+def test_a_bag_of_ros_1_says_what_to_do(tmp_path: Path) -> None:
+    bag = tmp_path / "drive.bag"
+    bag.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    for path in (bag, tmp_path):
+        for read in (BagReader, recover):
+            with pytest.raises(BagError, match=f"{bag}: is a bag of ROS 1: rosbags-convert makes one of ROS 2 of it"):
+                read(path)
+
+
 @pytest.mark.parametrize("single", [True, False], ids=["file", "folder"])
 @pytest.mark.parametrize("whole", [True, False], ids=["whole", "torn"])
 @pytest.mark.parametrize("suffix", [".zstd", ".zst"])
