@@ -32,7 +32,7 @@ from iwm_power_manager.tools.command import plain
 from iwm_sim.study import labels, paper, unseen
 from iwm_sim.study.answers import answers, savings
 from iwm_sim.study.content import Study
-from iwm_sim.study.frontier import COUNTS, SWINGS, Frontier, margin
+from iwm_sim.study.frontier import COUNTS, SAVED_PER_KM, SWINGS, Frontier, margin
 from iwm_sim.study.plan import IDLE_DRIVES
 from iwm_sim.study.report import Column, format_value
 from iwm_sim.study.rows import Place, Row, by_place
@@ -216,6 +216,7 @@ def unseen_summary(frontiers: Sequence[Frontier]) -> dict[str, Any]:
         "most_changes_per_min": max(point.changes_per_min for _, point, _ in judged),
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in unseen.judge(frontiers)],
         "swings": unseen.judge(frontiers, (SWINGS,)),
+        "per_km": unseen.judge(frontiers, saved=SAVED_PER_KM),
         "kinds": unseen.kinds(frontiers),
         "with_rivals": _margins([cell[2] for cell in judged if _has_rival(cell[0])]),
         "close_by_kind": {
@@ -282,6 +283,14 @@ def unseen_verdicts(found: dict[str, Any]) -> str:
         f"{100.0 * row['part_close']:.1f} % are at most {unseen.CLOSE:g} behind."
         for row in found.get("swings", ())  # a file of before they were counted has none
     )
+    per_km = found.get("per_km", ())  # likewise
+    if per_km:
+        worst = " / ".join(f"{row['worst']:+.3f}" for row in per_km)
+        close = " / ".join(f"{100.0 * row['part_close']:.1f}" for row in per_km)
+        swings += (
+            " By energy for a kilometre, which does not count against a car that it followed a trace better where the "
+            f"road is too slippery for it, the worst are {worst}, and {close} % are close."
+        )
     columns: list[Column[dict[str, Any]]] = [
         Column("changes counted", lambda row: _COUNTED[row["counted"]]),
         Column("cells", lambda row: row["cells"], decimals=0),

@@ -48,6 +48,8 @@ COUNTS = ("changes_per_min", "fine_changes_per_min", "travel_per_min")
 FINE_CHANGE = 0.05
 #: A fourth way, for what the first one is blind to; no part of any target.
 SWINGS = "swings_per_min"
+#: Ways of saying what was saved, by the field of `Point`; the second is no part of any target.
+SAVED, SAVED_PER_KM = "saving_percent", "saving_per_km_percent"
 
 _DT_S = 0.01
 
@@ -103,6 +105,8 @@ class Point(NamedTuple):
     held : whether this run and that of equal split held the trace
     policy : grid and checksum of the policy it was driven with, of ours
     swings_per_min : out of a band of a quarter (`share_swings`); None in a file of before they were counted
+    saving_per_km_percent : of the energy for a kilometre, which differs where the road is too slippery for the trace
+        and one of both fell behind it; None as `saving_percent`, or in a file of before it was measured
     """
 
     strategy: str
@@ -115,6 +119,7 @@ class Point(NamedTuple):
     held: bool
     policy: str = ""
     swings_per_min: float | None = None
+    saving_per_km_percent: float | None = None
 
 
 class Frontier(NamedTuple):
@@ -163,17 +168,23 @@ def _point(strategy: str, setting: float, run: Run, place: Place, reference: _Re
     metrics = measure(run, place.vehicle.params)
     minutes = run.series.shape[0] * run.dt_s / 60.0
     share = run["decided_share"]
+    saving = saving_percent(metrics, reference.metrics)
     return Point(
         strategy=strategy,
         setting=setting,
-        saving_percent=saving_percent(metrics, reference.metrics),
+        saving_percent=saving,
         changes_per_min=metrics.share_changes_per_min,
         fine_changes_per_min=share_changes(share, FINE_CHANGE) / minutes,
         travel_per_min=metrics.share_travel_per_min,
         busiest_minute=busiest_minute(share, run.dt_s),
         held=metrics.trace_held and reference.metrics.trace_held,
         swings_per_min=share_swings(share) / minutes,
+        saving_per_km_percent=None if saving is None else _per_km(metrics, reference.metrics),
     )
+
+
+def _per_km(one: Metrics, reference: Metrics) -> float:
+    return 100.0 * (1.0 - one.wh_per_km / reference.wh_per_km)
 
 
 def measure_frontier(
@@ -210,16 +221,18 @@ def measure_frontier(
     return Frontier(place.label, how, tuple(rivals), tuple(ours), tuple(limits))
 
 
-def margin(point: Point, rivals: Sequence[Point], count: str) -> float | None:
-    """Saving of a point minus the best of its rivals with no more changes, in points; None where there is none."""
-    if point.saving_percent is None or not point.held or getattr(point, count) is None:
+def margin(point: Point, rivals: Sequence[Point], count: str, saved: str = SAVED) -> float | None:
+    """Saving of a point minus the best of its rivals with no more changes, in points; None where there is none.
+
+    `count` and `saved` name the attributes of a point that say how often it changed and what it saved.
+    """
+    saving = getattr(point, saved)
+    if saving is None or not point.held or getattr(point, count) is None:
         return None
     within = getattr(point, count) + 1e-9
-    best = max(
-        (r.saving_percent for r in rivals if r.held and r.saving_percent is not None and getattr(r, count) <= within),
-        default=0.0,
-    )
-    return point.saving_percent - max(best, 0.0)
+    found = [getattr(rival, saved) for rival in rivals if rival.held and getattr(rival, count) <= within]
+    best = max((value for value in found if value is not None), default=0.0)
+    return float(saving - max(best, 0.0))
 
 
 def _bound(place: Place, reference: _Reference, ours: Run, others: Sequence[Point], point: Point) -> Point:

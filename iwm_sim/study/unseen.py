@@ -19,7 +19,7 @@ from iwm_power_manager.policy import load_policy
 from iwm_power_manager.vehicle import Vehicle
 from iwm_sim.study import generate
 from iwm_sim.study.cases import drawn_car, vehicle_of
-from iwm_sim.study.frontier import COUNTS, SWINGS, Frontier, Place, margin, measure_frontier
+from iwm_sim.study.frontier import COUNTS, SAVED, SAVED_PER_KM, SWINGS, Frontier, Place, margin, measure_frontier
 from iwm_sim.study.names import DEFAULT_GRID, DEFAULT_POLICY
 from iwm_sim.study.policies import PolicySource, solved
 from iwm_sim.study.report import Column
@@ -111,11 +111,11 @@ class Verdict(NamedTuple):
         return self.part_close >= PART and self.worst >= -WORST and self.mean > 0.0
 
 
-def judge(frontiers: Sequence[Frontier], counts: Sequence[str] = COUNTS) -> list[Verdict]:
+def judge(frontiers: Sequence[Frontier], counts: Sequence[str] = COUNTS, saved: str = SAVED) -> list[Verdict]:
     """The distribution of the margins, for each way of counting changes."""
     verdicts = []
     for count in counts:
-        found = [margin(point, f.rivals, count) for f in frontiers for point in f.ours]
+        found = [margin(point, f.rivals, count, saved) for f in frontiers for point in f.ours]
         known = np.array([value for value in found if value is not None])
         if known.size:
             low = float(np.quantile(known, 0.05))
@@ -194,10 +194,12 @@ def report(frontiers: Sequence[Frontier], worst: int = 10) -> str:
         f"{verdict.part_close:.1%}; target {'reached' if verdict.reached else 'NOT reached'}"
         for verdict in judge(frontiers)
     ]
+    beside = [(verdict, "") for verdict in judge(frontiers, (SWINGS,))]
+    beside += [(verdict, " and by Wh/km") for verdict in judge(frontiers, saved=SAVED_PER_KM)]
     lines += [
-        f"{verdict.counted}, no part of the target: worst {verdict.worst:+.3f} points; no more than {CLOSE:g} below in "
-        f"{verdict.part_close:.1%}"
-        for verdict in judge(frontiers, (SWINGS,))
+        f"{verdict.counted}{how}, no part of the target: worst {verdict.worst:+.3f} points; no more than {CLOSE:g} "
+        f"below in {verdict.part_close:.1%}"
+        for verdict, how in beside
     ]
     known = [(margin(f.ours[0], f.rivals, COUNTS[0]), f) for f in frontiers]
     ranked = sorted(((m, f) for m, f in known if m is not None), key=lambda pair: pair[0])
@@ -229,6 +231,7 @@ def to_json(frontiers: Sequence[Frontier]) -> dict[str, Any]:
         "package_version": __version__,
         "verdicts": [verdict._asdict() | {"reached": verdict.reached} for verdict in judge(frontiers)],
         "swings": judge(frontiers, (SWINGS,)),
+        "per_km": judge(frontiers, saved=SAVED_PER_KM),
         "kinds": kinds(frontiers),
         "cells": frontiers,
     }

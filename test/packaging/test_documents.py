@@ -155,3 +155,6 @@ def test_of_cells_that_nobody_chose_the_worst_and_those_without_a_rival_are_coun
     swings = {"worst": -0.25, "part_close": 0.5}
     assert found["swings"] == [] and "swings" not in documents.unseen_verdicts(found)
     assert "the worst margin is -0.250, and 50.0 %" in documents.unseen_verdicts(found | {"swings": [swings]})
+    assert found["per_km"] == [] and "for a kilometre" not in documents.unseen_verdicts(found)
+    text = documents.unseen_verdicts(found | {"per_km": [swings, swings | {"worst": -0.5}]})
+    assert "the worst are -0.250 / -0.500, and 50.0 / 50.0 % are close." in text

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.cycle import make_cycle
 from iwm_power_manager.policy import load_policy
 from iwm_power_manager.share import share_path
@@ -43,6 +44,20 @@ def test_margins_by_swings_stand_beside_the_judgement_and_are_no_part_of_it():
     assert unseen.to_json([blind])["swings"] == [swings]
     before = blind._replace(ours=(point(0.3, 5.0),))  # of a file without them
     assert unseen.judge([before], (frontier.SWINGS,)) == []
+
+
+def test_margins_by_energy_for_a_kilometre_stand_beside_the_judgement_and_are_no_part_of_it():
+    def driven(saving, per_km):
+        return point(saving, 5.0)._replace(saving_per_km_percent=per_km)
+
+    further = Frontier("further", MADE, (driven(0.5, 0.4), driven(0.6, None)), (driven(0.3, 0.45),), ())
+    by_km = unseen.judge([further], saved=frontier.SAVED_PER_KM)
+    assert [verdict.worst for verdict in by_km] == pytest.approx([0.05] * 3)
+    assert [verdict.worst for verdict in unseen.judge([further])] == pytest.approx([-0.3] * 3)
+    assert "travel_per_min and by Wh/km, no part of the target: worst +0.050 points" in unseen.report([further])
+    assert unseen.to_json([further])["per_km"] == by_km
+    before = further._replace(ours=(point(0.3, 5.0),))  # of a file without it
+    assert unseen.judge([before], saved=frontier.SAVED_PER_KM) == []
 
 
 def test_the_busiest_minute_counts_changes_by_more_than_a_quarter():
@@ -112,5 +127,10 @@ def test_the_bound_is_never_below_what_a_strategy_reached_with_no_more_changes()
     within = [p for p in found.rivals if p.changes_per_min <= ours.changes_per_min]
     assert all(bound.saving_percent >= p.saving_percent for p in within)
     assert len(found.rivals) == 3
+    runs = [frontier.drive(place, name, empty_table()).final for name in ("equal", "instantaneous")]
+    equal_j_per_m, blind_j_per_m = (final.energies.chemical_j / final.distance_m for final in runs)
+    per_km = 100.0 * (1.0 - blind_j_per_m / equal_j_per_m)
+    assert found.rivals[-1].saving_per_km_percent == pytest.approx(per_km, rel=1e-9)
+    assert found.rivals[-1].saving_percent != found.rivals[-1].saving_per_km_percent
     assert found.made_with == MADE
     assert ours.policy == f"coupled {policy.checksum[:8]}" and ours.setting == policy.problem.changes_per_min
