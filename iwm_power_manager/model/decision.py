@@ -329,6 +329,15 @@ class Settled(NamedTuple):
 
 
 @kernel
+def _usable_grip_n(vehicle: VehicleParams, problem: ProblemParams) -> float:
+    """Road force that the car's tyres carry, N; those of the better axle count for all."""
+    weight = vehicle.chassis.mass_kg * GRAVITY_MPS2
+    return (
+        USABLE_FRICTION * problem.friction * max(peak_ratio(vehicle.front.tyre), peak_ratio(vehicle.rear.tyre)) * weight
+    )
+
+
+@kernel
 def settled(
     power_demand_w: float, speed_mps: float, slip_aware: bool, vehicle: VehicleParams, problem: ProblemParams
 ) -> Settled:
@@ -337,10 +346,7 @@ def settled(
     # A driver makes up for what a split did not deliver: the speed follows what was asked for, as far as the road can
     # carry it. Would it follow what was delivered, then braking less than was asked for would leave a higher speed, at
     # which the same power is less force, and less of it were missing: a policy would be rewarded for not braking.
-    weight = vehicle.chassis.mass_kg * GRAVITY_MPS2
-    grip = (
-        USABLE_FRICTION * problem.friction * max(peak_ratio(vehicle.front.tyre), peak_ratio(vehicle.rear.tyre)) * weight
-    )
+    grip = _usable_grip_n(vehicle, problem)
     resistance = road_load_n(speed_mps, 0.0, vehicle.chassis)
     acceleration = (min(max(force, -grip), grip) - resistance) / equivalent_mass_kg(vehicle)
     after = max(speed_mps + problem.dt_s * acceleration, 0.0)
@@ -388,9 +394,9 @@ def slip_followed(
 
     They have to be turned faster, or slower, by the force itself: at a constant one their slip lags behind the settled
     one, s, by m v s / F, with m what their inertia stands for (docs/solver.md). That is hundredths of a second on a dry
-    road, and a tenth near the grip of an icy one.
+    road, and a tenth near the grip of an icy one. Beyond the grip the slip limiter holds it, whatever is asked for.
     """
-    if force_n == 0.0:
+    if force_n == 0.0 or abs(force_n) >= _usable_grip_n(vehicle, problem):
         return 1.0
     inertia_kg = equivalent_mass_kg(vehicle) - vehicle.chassis.mass_kg
     lag_s = inertia_kg * speed_mps * demand_slip(force_n, problem.friction, vehicle) / force_n

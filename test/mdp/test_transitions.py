@@ -285,6 +285,13 @@ def test_slip_is_followed_as_far_as_a_force_turns_wheels_while_it_is_held(speed,
     assert slip_followed(-4.0 * force_n, speed, held_s, car, _params(friction=friction)) == ours
 
 
+def test_beyond_the_grip_slip_is_the_limiters_and_lags_behind_no_demand():
+    params, weight_n = _params(friction=0.2), CAR.params.chassis.mass_kg * 9.81
+    for force_n in (0.21 * weight_n, -0.21 * weight_n, 0.6 * weight_n):
+        assert slip_followed(force_n, 20.0, 0.1, CAR.params, params) == 1.0
+    assert slip_followed(0.19 * weight_n, 20.0, 0.1, CAR.params, params) < 0.9
+
+
 def test_a_wheel_at_rest_or_without_force_has_no_slip_to_follow():
     params = _params(friction=0.2)
     assert slip_followed(0.0, 20.0, 0.1, CAR.params, params) == 1.0
