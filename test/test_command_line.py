@@ -59,6 +59,7 @@ def test_a_mistake_is_one_line_that_says_where_help_is(parser, arguments, words,
         (["--plot", "a.svg", "--json", "{here}/a.svg"], "--plot: a.svg would be written over what --json names"),
         (["b.csv", "--json", "b.csv"], "--json: b.csv would be written over what log names"),
         (["--json", "."], "--json: . cannot be written: it is a folder"),
+        (["--json", ""], "--json: an empty name cannot be written"),
         (["--cycle", "-", "--json", "-"], ""),
         (["equal", "--json", "equal"], ""),  # a word, and no file
         (["--cycle", "a.csv", "a.csv", "--json", "b.csv"], ""),

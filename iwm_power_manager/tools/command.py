@@ -130,6 +130,8 @@ def beside_json(json: str | None) -> redirect_stdout[TextIO]:
 
 def output_file(text: str) -> Written:
     """Argument type of a file's name to write to; what cannot be one is refused before anything is computed for it."""
+    if not text:
+        raise argparse.ArgumentTypeError("an empty name cannot be written")
     if text != "-" and not Path(text).absolute().parent.is_dir():
         raise argparse.ArgumentTypeError(f"{text} cannot be written: no such folder")
     if os.path.isdir(text):
