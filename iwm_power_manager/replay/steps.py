@@ -349,6 +349,8 @@ class ReconstructedSteps:
             found.append(f"only {steps} steps of {most} messages: {self.why_none()}")
         elif 0 < steps < _STEPS_LACK * self._wheels:
             found.append(f"only {steps} steps of {self._wheels} wheel speeds: {self.why_none()}")
+        elif steps and self._again > 1:
+            found.append(f"{self._again} wheel speeds have the stamp of the one before, and no step of their own")
         return found
 
     def _of(self, values: Sequence[Recorded]) -> list[ReplayedStep]:

@@ -512,6 +512,12 @@ def test_stamps_that_stand_still_from_some_time_on_are_said(tmp_path: Path, mapp
     assert f"{COUNT // 2 - 1} wheel speeds with the stamp of the one before" in note
 
 
+def test_where_a_clock_was_set_back_by_less_than_a_second_lost_steps_are_said(tmp_path: Path, mapping: Path) -> None:
+    entries = drive(stamp=lambda ns: ns) + drive(5, start_ns=foreign.START_NS + (COUNT - 5) * foreign.PERIOD_NS)
+    report, _ = replayed(write_bag(tmp_path / "bag", entries), mapping)
+    assert "5 wheel speeds have the stamp of the one before, and no step of their own" in report.notes
+
+
 def test_far_fewer_steps_than_messages_are_said(tmp_path: Path, mapping: Path) -> None:
     entries = [entry for i, entry in enumerate(drive()) if entry[1] != 2 or i < 15]
     report, _ = replayed(write_bag(tmp_path / "bag", entries), mapping)
