@@ -216,12 +216,13 @@ class SignalMapping(NamedTuple):
         Raises
         ------
         ConfigError
-            A name is none, one topic has two names, two wheels are one number, or a command goes where something else
-            comes from or goes to.
+            A name is none, one topic has two names, two wheels are one number, a demand is what a sensor shows, or a
+            command goes where something else comes from or goes to.
         """
         taken = dict.fromkeys(_OF_ROS, "is ROS's own") | dict.fromkeys(own, "is this node's own")
         inputs: dict[str, Source] = {}
         numbers: dict[tuple[str, str, str], Source] = {}
+        fields: dict[tuple[bool, str, str], Source] = {}  # of what is asked for, and of what is measured
         for signal, source in ((signal, source) for signal, sources in self.sources.items() for source in sources):
             full = self._resolved(source, resolve, taken)
             first = inputs.setdefault(full, source)
@@ -232,6 +233,12 @@ class SignalMapping(NamedTuple):
             if wheel is not source:
                 problem = f"{source.field} of {full} is another wheel's as well ({wheel.key})"
                 raise ConfigError(self.path, f"{source.key}.field", problem, "a number of its own for each wheel")
+            if signal != "direction":  # may well be the sign of a demand, or of the speed
+                asks = signal in (*DEMANDS, *PEDALS)
+                fields[asks, full, source.field] = source
+                if found := fields.get((not asks, full, source.field)):
+                    problem = f"{source.field} of {full} is {found.key} as well"
+                    raise ConfigError(self.path, f"{source.key}.field", problem, "a demand of its own")
         taken |= {full: f"is an input as well ({source.key})" for full, source in inputs.items()}
         for sink in (sink for sinks in self.commands.values() for sink in sinks):
             taken[self._resolved(sink, resolve, taken)] = f"carries a command as well ({sink.key})"

@@ -102,6 +102,25 @@ def test_a_topic_without_slash_is_found_in_its_namespace_unless_there_are_two() 
         topic_named("speed", ["/b/speed", "/a/speed"])
 
 
+@pytest.mark.parametrize(("signal", "refused"), [("force_demand", True), ("brake_pedal", True), ("direction", False)])
+@pytest.mark.parametrize("first", [True, False])
+def test_a_demand_that_is_what_a_sensor_shows_is_refused(
+    tmp_path: Path, signal: str, refused: bool, first: bool
+) -> None:
+    unit = {"force_demand": "N"}.get(signal, "'1'")
+    lines = [
+        "  speed: {topic: /odom, field: x, unit: m/s}\n",
+        f"  {signal}: {{topic: /odom, field: x, unit: {unit}}}\n",
+    ]
+    path = tmp_path / "signals.yaml"
+    path.write_text("signals:\n" + "".join(lines if first else lines[::-1]))
+    if not refused:
+        load_mapping(path).check_topics()
+        return
+    with pytest.raises(ConfigError, match=r"field: x of /odom is signals\.\w+ as well; allowed: a demand of its own"):
+        load_mapping(path).check_topics()
+
+
 @pytest.mark.parametrize(
     ("entries", "problem"),
     [
