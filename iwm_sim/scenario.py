@@ -196,6 +196,7 @@ def load_scenario(name: Path | str, idle_drive: str | None = None, vehicle: Vehi
     road = files.check_keys(path, content["road"], ("friction",), ("grade", "headwind_mps"), "road")
     friction = _friction(path, road["friction"])
     duration_s, to_standstill = _until(path, content.get("until"), cycle)
+    _check_reached(path, content, duration_s)
     about = content["about"]
     if not isinstance(about, str) or not about.strip():
         raise ConfigError(path, "about", f"{about!r} is no sentence", "text that is not empty")
@@ -261,6 +262,15 @@ def _until(path: Path, content: Any, cycle: Cycle | None) -> tuple[float, bool]:
     if cycle is not None:
         time_s = min(time_s, cycle.duration_s)
     return time_s, files.check_bool(path, "until.standstill", content.get("standstill", False))
+
+
+def _check_reached(path: Path, content: Mapping[str, Any], duration_s: float) -> None:
+    """Refuse what would begin after the end: nothing would be tested by it, and what is required would be met."""
+    for key in ("demand", "steering", "foreign_brakes", "faults"):
+        for i, entry in enumerate(content.get(key) or () if isinstance(content.get(key), list) else ()):
+            begins = entry.get("from_s") if isinstance(entry, dict) else None
+            if isinstance(begins, int | float) and begins >= duration_s:
+                raise ConfigError(path, f"{key}[{i}].from_s", f"{begins:g} is never reached", f"< {duration_s:g} s")
 
 
 def _listed(path: Path, key: str, content: Any, start: str, least: float) -> list[tuple[str, Mapping[str, Any]]]:

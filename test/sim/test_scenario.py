@@ -130,6 +130,14 @@ def test_a_cycle_and_a_vehicle_may_stand_beside_the_file(tmp_path):
             {"demand": [{"from_s": 1.0, "brake": 1.0}, {"from_s": 1.0, "brake": 0.0}]},
             r"demand\[1\].from_s: 1 does not rise",
         ),
+        (
+            {"demand": [{"from_s": 0.0, "brake": 1.0}, {"from_s": 500.0, "brake": 0.0}], "until": {"time_s": 10.0}},
+            r"demand\[1\].from_s: 500 is never reached; allowed: < 10 s",
+        ),
+        (
+            {"faults": [{"message": "power_demand", "lost": True, "from_s": 1e4}]},
+            r"faults\[0\].from_s: 10000 is never reached",
+        ),
         ({"until": None}, "until: is missing"),
         ({"until": {"time_s": 0.0}}, "until.time_s"),
         ({"until": {"time_s": 5.0, "standstill": 1}}, "until.standstill: 1 is neither"),
