@@ -197,7 +197,9 @@ def _check_rows(path: Path | str, places: list[str], columns: dict[str, NDArray[
             bad = np.flatnonzero((values < low) | (values > high))
             if bad.size:
                 problem = f"{name} {values[bad[0]]:g} is out of range"
-                if name == "speed_mps" and values[bad[0]] > high:
+                if name == "grade":
+                    problem += ": percent or degrees? it is rise over run"
+                elif values[bad[0]] > high:
                     problem += _unit_hint(columns)
                 raise ConfigError(path, places[bad[0]], problem, f"{low:g} to {high:g}")
     back = np.flatnonzero(np.diff(columns["time_s"]) <= 0.0)

@@ -112,7 +112,10 @@ def test_windows_line_ends_and_a_byte_order_mark_are_read(write):
         ("time_s,speed_mps\n0,0\n1," + "1" * 5000 + "\n", "line 3: has 5002 characters; allowed: <= 4096"),
         ("time_s,speed_mps\n0," + '"' * 200_001 + "\n", "line 2: has 200003 characters"),
         ("time_s,speed_mps\n0,1\n1,71\n", "line 3: speed_mps 71 is out of range"),
-        ("time_s,speed_mps,grade\n0,1,0\n1,1,0.6\n", "line 3: grade 0.6 is out of range; allowed: -0.5 to 0.5"),
+        (
+            "time_s,speed_mps,grade\n0,1,0\n1,1,0.6\n",
+            "line 3: grade 0.6 is out of range: percent or degrees? it is rise over run; allowed: -0.5 to 0.5",
+        ),
         ("time_s,speed_mps\n# pause\n0,1\n2,1\n\n2,1\n", "line 6: time_s 2 does not increase; allowed: > 2 s"),
         ("time_s,speed_mps\n5,1\n2,1\n", "line 3: time_s 2 does not increase"),
         (b"time_s,speed_mps\n0,\xff\n", "is not UTF-8 text"),
