@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is wrong with a command line is one line."""
 
+import argparse
+import os
 from argparse import BooleanOptionalAction
 
 import pytest
@@ -104,3 +106,11 @@ def test_an_option_without_effect_is_refused_only_where_it_was_given(parser, cap
     with pytest.raises(SystemExit):
         parser.check(parser.parse_args(["--record"]), useful)
     assert "draw: error: arguments: --record: has no effect: nothing runs (see draw --help)" in capsys.readouterr().err
+
+
+def test_a_folder_that_may_not_be_written_to_is_said_before_anything_is_computed(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "access", lambda path, mode: str(path) != str(tmp_path))
+    for kind, name in ((output_file, "a.json"), (picture, "a.svg")):
+        with pytest.raises(argparse.ArgumentTypeError, match="cannot be written: its folder may not be written to"):
+            kind(str(tmp_path / name))
+    assert output_file("/dev/null") and output_file("-")

@@ -136,6 +136,9 @@ def output_file(text: str) -> Written:
         raise argparse.ArgumentTypeError(f"{text} cannot be written: no such folder")
     if os.path.isdir(text):
         raise argparse.ArgumentTypeError(f"{text} cannot be written: it is a folder")
+    replaced = os.path.isfile(text) or not os.path.exists(text)  # not a pipe or a device, which is written to
+    if text != "-" and replaced and not os.access(Path(os.path.realpath(text)).parent, os.W_OK):
+        raise argparse.ArgumentTypeError(f"{text} cannot be written: its folder may not be written to")
     return Written(text)
 
 
