@@ -69,6 +69,8 @@ def targets(output: Path, vehicle: Vehicle, problem: Problem, frictions: Sequenc
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError("arguments", "--output", f"{output}: {error.strerror}", "a folder or a .npz file") from None
+    if not os.access(output, os.W_OK):
+        raise ConfigError("arguments", "--output", f"{output}: may not be written to", "a folder or a .npz file")
     stem = re.sub(r"[^a-z0-9]+", "_", f"{vehicle.name} {vehicle.idle_drive} {problem.name}".lower()).strip("_")
     return [output / f"{stem}_mu{friction_in_name(friction)}.npz" for friction in frictions]
 

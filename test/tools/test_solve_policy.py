@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 
@@ -343,3 +344,10 @@ def test_as_a_process_it_teaches_and_exits_with_its_codes(tmp_path):
     gone = f"none.yaml: cannot be read: No such file or directory (looked for from {tmp_path})"
     assert missing.stderr == f"solve_policy: error: {gone}\n"
     assert call("--cycle", "nycc").returncode == 2
+
+
+def test_a_folder_that_may_not_be_written_to_is_said_before_anything_is_solved(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)
+    given = ["--vehicle", "jalalmaab_2015", "--cycle", "nycc", "--friction", "0.9", "--output", str(tmp_path)]
+    assert solve_policy.main(given) == 2
+    assert f"--output: {tmp_path}: may not be written to; allowed: a folder or a .npz file" in capsys.readouterr().err
