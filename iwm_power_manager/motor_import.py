@@ -27,6 +27,7 @@ _OTHER_UNITS = {
 #: What the head of a column says of it.
 _TORQUE, _SPEED = re.compile("torque|moment|n ?m(?![a-z])", re.I), re.compile("speed|drehzahl|rpm|min|rad|omega", re.I)
 _LOSS = "loss|verlust"
+_VALUE = rf"effic|wirkungsgrad|\beta\b|{_LOSS}"
 #: A map with so few of its grid's points is on no grid.
 _SPARSE = 0.25
 #: Half of a motor's map is never better.
@@ -238,6 +239,12 @@ def _list(table: Table, said: list[str]) -> list[tuple[int, float, float, float]
     *header, _ = _header(table)
     swapped = any(len(row) == 3 and re.search(_TORQUE, row[0]) and re.search(_SPEED, row[1]) for _, row in header)
     said += ["torques in the first column, as the header says"] if swapped else []
+    for line, row in header:
+        early = next(
+            (cell for cell in row[:2] if len(row) == 3 and all(row) and re.search(_VALUE, cell, re.IGNORECASE)), None
+        )
+        if early is not None:
+            raise ConfigError(table.path, f"line {line}", f"{early!r} is not the last column", "speed, torque, value")
     rows = []
     for line, cells in table.rows[len(header) :]:
         if len(cells) != 3:

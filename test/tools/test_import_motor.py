@@ -126,6 +126,11 @@ def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys)
         ("", (), "is empty"),
         ("w,t,eta\n1,2\n", ("--layout", "list"), "line 2: has 2 values; allowed: 3: speed, torque, value"),
         ("w,t,eta\n1,x,0.5\n", (), "line 2, torque_nm: 'x' is no number"),
+        (
+            "Efficiency,Torque,Speed\n0.5,1,2\n",
+            (),
+            "line 1: 'Efficiency' is not the last column; allowed: speed, torque",
+        ),
         ("w,t,eta\n1,2,0.5\n1,2,0.6\n", (), "line 3: repeats speed 1, torque 2"),
         ("w,t,eta\n1,2,300\n", (), "line 2: efficiency 3 is out of range"),
         ("w,t,eta\n1,2,85\n2,3,0.5\n", ("--no-percent",), "line 2: efficiency 85 is out of range; allowed: 0 to 1, or"),
