@@ -22,12 +22,12 @@ COMMANDS = [
 
 #: Stands in for a library whose import takes long.
 SLOW = """\
-import signal
-signal.signal(signal.SIGUSR1, lambda *_: print("still importing", flush=True))
-print("importing", flush=True)
+import os, signal, time
+signal.signal(signal.SIGUSR1, lambda *_: os.write(1, b"still importing\\n"))  # print() may be interrupted by itself
+os.write(1, b"importing\\n")
 try:
     while True:
-        signal.pause()
+        time.sleep(0.01)  # pause() would sleep on through a signal that came just before it
 except BaseException as error:
     raise ImportError("half imported") from error
 """
