@@ -15,13 +15,15 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 
 ROOT = Path(__file__).resolve().parents[1]
-_KEEP_TIME = {
-    f"test_{name}.py"
-    for name in (
-        *("cluster", "domains", "executables", "faults", "fleet", "held", "power_cut", "processes", "recorded"),
-        *("recording", "recover", "run", "watch_car", "witness"),
-    )
-}
+#: Files whose tests have bounds on the clock, send signals at chosen moments, watch what the machine does, or wait for a
+#: process of low priority.
+_KEEP_TIME = (
+    *(f"/bags/test_{name}.py" for name in ("power_cut", "recording", "recover")),
+    *(f"/campaigns/test_{name}.py" for name in ("faults", "witness")),
+    *(f"/ros/test_{name}.py" for name in ("interruption", "realtime", "spinning")),
+    *(f"/ros/test_power_manager_{name}.py" for name in ("cold", "held_up", "pace", "second_publisher", "time")),
+    *("/sim/test_processes.py", "/tools/test_watch_car.py"),
+)
 
 #: In pytest's cache: the run of all other tests, which comes first, had none.
 _NONE_OF_THE_OTHERS = "make_test/none_of_the_others"
@@ -78,10 +80,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what starts, signals or counts processes that keep time: these have the cores for themselves."""
+    """Mark what keeps time: these tests have the cores for themselves; others wait for what has to happen."""
     for item in items:
-        parts = item.path.relative_to(ROOT).parts
-        if "ros" in parts or parts[-1] in _KEEP_TIME:
+        if item.path.as_posix().endswith(_KEEP_TIME):
             item.add_marker(pytest.mark.processes)
 
 

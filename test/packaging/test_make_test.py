@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parents[2]
     ("chosen", "ends_well"),
     [
         ("test/test_files_page.py", True),  # keeps no time
-        ("test/test_held.py", True),  # keeps it
-        ("test/test_files_page.py test/test_held.py -k no_test_is_called_this", False),
+        ("test/sim/test_processes.py", True),  # keeps it
+        ("test/test_files_page.py test/sim/test_processes.py -k no_test_is_called_this", False),
     ],
 )
 def test_one_of_its_runs_may_have_no_test_but_not_both(chosen: str, ends_well: bool, tmp_path: Path) -> None:

@@ -557,12 +557,14 @@ def kill_while_publishing(path: Path, recorder: Callable[..., RecorderProcess], 
     return lost_s
 
 
+@pytest.mark.processes
 def test_killed_at_1_khz_the_node_loses_less_than_its_last_second(
     tmp_path: Path, recorder: Callable[..., RecorderProcess]
 ) -> None:
     kill_while_publishing(tmp_path / "bag", recorder, 0.7)
 
 
+@pytest.mark.processes
 @pytest.mark.nightly
 @pytest.mark.timeout(1800)
 def test_killed_fifty_times_at_1_khz_the_node_loses_less_than_its_last_second(
