@@ -15,14 +15,14 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Files whose tests have bounds on the clock, send signals at chosen moments, watch what the machine does, or wait for a
-#: process of low priority.
+#: Files whose tests have bounds on the clock, send signals at chosen moments, watch what the machine does, or wait for
+#: a process of low priority.
 _KEEP_TIME = (
     *(f"/bags/test_{name}.py" for name in ("power_cut", "recording", "recover")),
     *(f"/campaigns/test_{name}.py" for name in ("faults", "witness")),
-    *(f"/ros/test_{name}.py" for name in ("interruption", "realtime", "spinning")),
-    *(f"/ros/test_power_manager_{name}.py" for name in ("cold", "held_up", "pace", "second_publisher", "time")),
-    *("/sim/test_processes.py", "/tools/test_watch_car.py"),
+    *(f"/ros/test_{name}.py" for name in ("ending", "interruption", "realtime", "replay_publish", "spinning")),
+    *(f"/ros/test_power_manager_{name}.py" for name in ("cold", "held_up", "inputs", "pace", "time")),
+    *("/ros/test_power_manager_second_publisher.py", "/sim/test_processes.py", "/tools/test_watch_car.py"),
 )
 
 #: In pytest's cache: the run of all other tests, which comes first, had none.

@@ -262,6 +262,7 @@ def test_what_it_waits_for_is_told_before_it_gives_up(stand_in) -> None:
 # --- real time ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.processes
 def test_faster_than_real_time_it_publishes_the_clock_and_reaches_the_end(stand_in) -> None:
     pair = stand_in(lockstep=False, rate_hz=50.0, speed_factor=5.0, command_timeout_s=5.0)
     run, notes = pair.run()
@@ -272,6 +273,7 @@ def test_faster_than_real_time_it_publishes_the_clock_and_reaches_the_end(stand_
     assert run["speed_mps"].max() > 3.0
 
 
+@pytest.mark.processes
 def test_in_real_time_there_is_no_clock_and_stamps_are_the_systems_time(stand_in) -> None:
     pair = stand_in(lockstep=False, rate_hz=50.0, until_s=1.0)
     before = pair.node.get_clock().now().nanoseconds
@@ -282,6 +284,7 @@ def test_in_real_time_there_is_no_clock_and_stamps_are_the_systems_time(stand_in
     assert len(run.series) == 50
 
 
+@pytest.mark.processes
 def test_commands_that_stop_leave_motors_off_and_brakes_at_the_pedal(stand_in) -> None:
     pair = stand_in(lockstep=False, rate_hz=50.0, speed_factor=2.0, command_timeout_s=1.0)
 
@@ -473,6 +476,7 @@ def test_a_scenario_is_driven_as_its_file_says(tmp_path: Path, stand_in: Callabl
     assert {first.road_fl, first.road_fr, first.road_rl, first.road_rr} == {0.2, 0.9}
 
 
+@pytest.mark.processes
 def test_in_real_time_a_late_message_comes_with_the_stamp_of_its_measurement(
     tmp_path: Path, stand_in: Callable[..., StandIn]
 ) -> None:
