@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drive strategies over cycles and compare them: `evaluate --help`.
 
-Exit codes: 0 done; 2 bad arguments or files; 130 interrupted.
+Exit codes: 0 done; 1 a scenario does not meet what it requires; 2 bad arguments or files; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ examples:
 Vehicles, cycles and grids that come with the package are found by name. Results go to stdout, progress to stderr. An
 option that has no effect on what is asked for is refused.
 
-exit codes: 0 done, 2 bad arguments or files, 130 interrupted
+exit codes: 0 done, 1 a scenario does not meet what it requires, 2 bad arguments or files, 130 interrupted
 """
 
 #: Settings of the law that are options.
@@ -245,12 +245,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return ended("evaluate", lambda: _evaluate(options), folder, quiet=options.quiet)
 
 
-def _evaluate(options: argparse.Namespace) -> None:
+def _evaluate(options: argparse.Namespace) -> int | None:
     mode = next((name for name in MODES if getattr(options, name)), "")
     refuse_without_effect(options, _useful_in(mode, options) if mode else _useful_in_cases(options))
     from iwm_sim.tools.evaluate_run import run
 
-    run(mode, options)
+    return run(mode, options)
 
 
 # --- options that would have no effect ------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import itertools
 import tempfile
 import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from iwm_power_manager import __version__
@@ -17,6 +17,7 @@ from iwm_power_manager.control import settings as law_settings
 from iwm_power_manager.control.strategies import DEFAULT_STRATEGY, drivable
 from iwm_power_manager.cycle import Cycle
 from iwm_power_manager.errors import ConfigError
+from iwm_power_manager.exit_codes import DONE, FAILED
 from iwm_power_manager.files import atomic_write, friction_in_name, make_folder
 from iwm_power_manager.tools.command import PICTURES, doubts, made_with, write_json, write_picture
 from iwm_power_manager.tools.progress import Bar
@@ -38,13 +39,13 @@ from iwm_sim.study.variants import VARIANTS
 from iwm_sim.tools.precompile import compile_for_a_drive
 
 
-def run(mode: str, options: argparse.Namespace) -> None:
-    """Do what is asked for; `mode` is a key of `evaluate.MODES`, or "" for single cases."""
+def run(mode: str, options: argparse.Namespace) -> int | None:
+    """Do what is asked for; `mode` is a key of `evaluate.MODES`, or "" for single cases. Returns an exit code."""
     options.say = silent if options.quiet else tell
     cycles = _distinct(options.cycle or ())
     if mode and cycles:
         _tell_doubts(doubts(cases.vehicle_of(options.vehicle, ""), cycles, options.friction or []))
-    _RUN[mode](options)
+    return _RUN[mode](options)
 
 
 # --- cases ----------------------------------------------------------------------------------------------------------
@@ -289,8 +290,8 @@ def _fit_battery(options: argparse.Namespace) -> None:
         write_json(options.json, fit)
 
 
-def _scenario(options: argparse.Namespace) -> None:
-    """Each scenario with each strategy: what comes out, beside what is required."""
+def _scenario(options: argparse.Namespace) -> int:
+    """Each scenario with each strategy: what comes out, beside what is required; `FAILED` where that is not met."""
     idle_drive = _only("--idle-drive", options.idle_drive, "") or None
     scenarios = [load_scenario(name, idle_drive) for name in dict.fromkeys(options.scenario)]
     strategies = list(dict.fromkeys(options.strategy or [DEFAULT_STRATEGY]))
@@ -311,6 +312,7 @@ def _scenario(options: argparse.Namespace) -> None:
             rows.append(made | {"values": result.values})
     if options.json:
         write_json(options.json, rows)
+    return DONE if all(row["passed"] for row in rows) else FAILED
 
 
 def _frontier(options: argparse.Namespace) -> None:
@@ -360,7 +362,7 @@ def _unseen(options: argparse.Namespace) -> None:
         print(f"{text}\nin {took_min:.0f} min: {folder}/unseen.json, margins.svg, unseen.txt")
 
 
-_RUN = {
+_RUN: Mapping[str, Callable[[argparse.Namespace], int | None]] = {
     "frontier": _frontier,
     "unseen": _unseen,
     "": _evaluate,

@@ -388,13 +388,15 @@ def test_scenarios_are_driven_with_each_strategy_and_say_what_they_require(tmp_p
     )
     rows = tmp_path / "rows.json"
     given = ["--scenario", str(scenario), "--strategy", "equal", "instantaneous", "--json", str(rows)]
-    assert evaluate.main(given) == 0
+    assert evaluate.main(given) == 1
     out = capsys.readouterr().out
     assert out.count("FAIL  short_stop: A short stop.") == 2
     found = json.loads(rows.read_text())
     assert [row["strategy"] for row in found] == ["equal", "instantaneous"]
     assert not found[0]["passed"]
     assert found[0]["values"]["stopping_distance_m"] < 20.0
+    scenario.write_text(scenario.read_text().replace("at_most: 0.1", "at_most: 3.0"))
+    assert evaluate.main(["--scenario", str(scenario), "--strategy", "equal", "--quiet"]) == 0
 
 
 def test_a_strategy_that_knows_the_future_drives_no_scenario(capsys):
