@@ -23,6 +23,10 @@ _KEEP_TIME = (
     *(f"/ros/test_{name}.py" for name in ("ending", "interruption", "realtime", "replay_publish", "spinning")),
     *(f"/ros/test_power_manager_{name}.py" for name in ("cold", "held_up", "inputs", "pace", "time")),
     *("/ros/test_power_manager_second_publisher.py", "/sim/test_processes.py", "/tools/test_watch_car.py"),
+    # and those that send single messages between processes which have just found each other
+    *(f"/ros/test_{name}.py" for name in ("connect", "examples", "interface_page", "neighbours", "recorder_node")),
+    *(f"/ros/test_power_manager_{name}.py" for name in ("demand_log", "errors", "hostile", "lifecycle", "names")),
+    "/ros/test_without_shared_memory.py",
 )
 
 #: In pytest's cache: the run of all other tests, which comes first, had none.

@@ -194,6 +194,8 @@ def test_default_topics_honour_namespace_and_remaps_and_metadata_tells_files_and
         remaps=("__ns:=/car", "power_demand:=/other/demand"),
     )
     peer.until_ready("/car")
+    # The recorder has found both publishers; they may not have found it yet.
+    peer.until(lambda: speed.get_subscription_count() > 0 < demand.get_subscription_count(), "both subscriptions")
     speed.publish(TwistStamped())
     demand.publish(Float64(data=1.0))
 
