@@ -15,15 +15,14 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Files whose tests have bounds on the clock, send signals at chosen moments, watch what the machine does, or wait for
-#: a process of low priority.
+#: Files whose tests have bounds on the clock, send signals at chosen moments, watch what the machine does, wait for a
+#: process of low priority, or send single messages between processes that have just found each other.
 _KEEP_TIME = (
     *(f"/bags/test_{name}.py" for name in ("power_cut", "recording", "recover")),
     *(f"/campaigns/test_{name}.py" for name in ("faults", "witness")),
     *(f"/ros/test_{name}.py" for name in ("ending", "interruption", "realtime", "replay_publish", "spinning")),
     *(f"/ros/test_power_manager_{name}.py" for name in ("cold", "held_up", "inputs", "pace", "time")),
     *("/ros/test_power_manager_second_publisher.py", "/sim/test_processes.py", "/tools/test_watch_car.py"),
-    # and those that send single messages between processes which have just found each other
     *(f"/ros/test_{name}.py" for name in ("connect", "examples", "interface_page", "neighbours", "recorder_node")),
     *(f"/ros/test_power_manager_{name}.py" for name in ("demand_log", "errors", "hostile", "lifecycle", "names")),
     "/ros/test_without_shared_memory.py",

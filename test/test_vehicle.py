@@ -474,6 +474,12 @@ def test_the_page_has_the_table():
             "battery.nominal_cell_voltage_v",
             "means 1.67 of the open",
         ),
+        (
+            ("battery", "nominal_cell_voltage_v"),
+            1.2,
+            "battery.nominal_cell_voltage_v",
+            "means 0.363 of the open",
+        ),
         (("wheel", "inertia_kgm2"), 0.0011, "wheel.inertia_kgm2", "g m2, or kg cm2 in a kg m2 field?"),
         (("wheel", "inertia_kgm2"), 110.0, "wheel.inertia_kgm2", "kg cm2 in a kg m2 field"),
         (("chassis", "air_density_kgpm3"), 0.0012, "chassis.air_density_kgpm3", "g/cm3 in a kg/m3 field?"),

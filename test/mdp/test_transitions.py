@@ -292,6 +292,17 @@ def test_beyond_the_grip_slip_is_the_limiters_and_lags_behind_no_demand():
     assert slip_followed(0.19 * weight_n, 20.0, 0.1, CAR.params, params) < 0.9
 
 
+@pytest.mark.parametrize("better", ["front", "rear"])
+def test_beyond_the_grip_is_what_the_better_axles_tyres_do_not_carry(better):
+    axle = getattr(CAR.params, better)
+    stiffness, shape, peak, *rest = axle.tyre.coefficients
+    tyre = axle.tyre._replace(coefficients=(stiffness, shape, 1.2 * peak, *rest))
+    car = CAR.params._replace(**{better: axle._replace(tyre=tyre)})
+    params, weight_n = _params(friction=0.2), car.chassis.mass_kg * 9.81
+    assert slip_followed(0.21 * weight_n, 20.0, 0.1, car, params) < 0.9
+    assert slip_followed(0.25 * weight_n, 20.0, 0.1, car, params) == 1.0
+
+
 def test_a_wheel_at_rest_or_without_force_has_no_slip_to_follow():
     params = _params(friction=0.2)
     assert slip_followed(0.0, 20.0, 0.1, CAR.params, params) == 1.0

@@ -22,6 +22,7 @@ from iwm_power_manager.control.record import measurement_of
 from iwm_power_manager.control.settings import default_settings
 from iwm_power_manager.control.table import empty_table
 from iwm_power_manager.cycle import load_cycle
+from iwm_power_manager.exit_codes import INTERRUPTED
 from iwm_power_manager.model.motor import electrical_power_w
 from iwm_power_manager.replay.plan import Choice, make_plan
 from iwm_power_manager.replay.run import Replay
@@ -32,6 +33,8 @@ from iwm_sim import closed_loop
 from iwm_sim.closed_loop import COLUMNS, Run
 from iwm_sim.drive import load_run
 from iwm_sim.drive_bag import read_drive_bag, with_decisions
+from iwm_sim.tools import demo as demo_tool
+from iwm_sim.tools import demo_run
 
 STEPS = 1200
 STRATEGY = "instantaneous_slip"
@@ -283,3 +286,17 @@ def test_a_scenario_is_driven_over_dds_and_held_against_what_it_requires(tmp_pat
     assert 1.0 < json.loads(done.stdout)["stopping_distance_m"] < 20.0  # and nothing else stands there
     assert "pass  short_stop: A short stop." in done.stderr
     assert "all that were published" in done.stderr
+
+
+def test_a_gap_in_a_scenarios_cycle_is_said_before_it_is_driven(tmp_path: Path, monkeypatch, capsys) -> None:
+    cycle, road = tmp_path / "tunnel.csv", tmp_path / "tunnel.yaml"
+    cycle.write_text("time_s,speed_mps\n0,9\n1,10\n2,10\n62,10\n63,9\n64,9\n")
+    road.write_text(f"format: 1\nabout: A tunnel.\ncycle: {cycle}\nroad: {{friction: 0.9}}\nuntil: {{time_s: 1}}\n")
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo_run, "compile_for_a_drive", interrupted)
+    arguments = ["--scenario", str(road), "--strategy", "equal", "--output", str(tmp_path / "run")]
+    assert demo_tool.main(arguments) == INTERRUPTED
+    assert f"demo: warning: {cycle}: line 5: is 60 s after the one before" in capsys.readouterr().err

@@ -138,6 +138,14 @@ def test_a_cycle_and_a_vehicle_may_stand_beside_the_file(tmp_path):
             {"faults": [{"message": "power_demand", "lost": True, "from_s": 1e4}]},
             r"faults\[0\].from_s: 10000 is never reached",
         ),
+        (
+            {"steering": [{"from_s": 10.0, "wheel_deg": 90.0}], "until": {"time_s": 10.0}},
+            r"steering\[0\].from_s: 10 is never reached",
+        ),
+        (
+            {"foreign_brakes": [{"from_s": 11.0, "braking_mps2": 4.0}], "until": {"time_s": 10.0}},
+            r"foreign_brakes\[0\].from_s: 11 is never reached",
+        ),
         ({"until": None}, "until: is missing"),
         ({"until": {"time_s": 0.0}}, "until.time_s"),
         ({"until": {"time_s": 5.0, "standstill": 1}}, "until.standstill: 1 is neither"),

@@ -395,8 +395,10 @@ def test_scenarios_are_driven_with_each_strategy_and_say_what_they_require(tmp_p
     assert [row["strategy"] for row in found] == ["equal", "instantaneous"]
     assert not found[0]["passed"]
     assert found[0]["values"]["stopping_distance_m"] < 20.0
-    scenario.write_text(scenario.read_text().replace("at_most: 0.1", "at_most: 3.0"))
-    assert evaluate.main(["--scenario", str(scenario), "--strategy", "equal", "--quiet"]) == 0
+    met = tmp_path / "met.yaml"
+    met.write_text(scenario.read_text().replace("at_most: 0.1", "at_most: 3.0"))
+    assert evaluate.main(["--scenario", str(met), "--strategy", "equal", "--quiet"]) == 0
+    assert evaluate.main(["--scenario", str(met), str(scenario), "--strategy", "equal", "--quiet"]) == 1
 
 
 def test_a_strategy_that_knows_the_future_drives_no_scenario(capsys):

@@ -131,6 +131,11 @@ def test_what_the_map_lacks_of_what_the_motor_shall_do_is_said(tmp_path, capsys)
             (),
             "line 1: 'Efficiency' is not the last column; allowed: speed, torque",
         ),
+        (
+            "Speed,Eta,Torque\n1,0.5,2\n",
+            (),
+            "line 1: 'Eta' is not the last column; allowed: speed, torque",
+        ),
         ("w,t,eta\n1,2,0.5\n1,2,0.6\n", (), "line 3: repeats speed 1, torque 2"),
         ("w,t,eta\n1,2,300\n", (), "line 2: efficiency 3 is out of range"),
         ("w,t,eta\n1,2,85\n2,3,0.5\n", ("--no-percent",), "line 2: efficiency 85 is out of range; allowed: 0 to 1, or"),
