@@ -14,6 +14,8 @@ from iwm_power_manager.jit import kernel
 
 #: The limiter never steers to less than this slip speed, m/s: at walking pace a slip of 0.15 is within the noise.
 LEAST_SLIP_SPEED_MPS = 0.3
+#: Nor is a driven wheel gated at less, m/s: the default critical slip is beyond the target by as much.
+LEAST_GATED_MPS = 1.25 * LEAST_SLIP_SPEED_MPS
 
 #: Torque where the limiter has no say, N m: more than any wheel can be asked for.
 UNLIMITED_NM = 1e9
@@ -23,6 +25,20 @@ UNLIMITED_NM = 1e9
 def worse_slip(left: float, right: float) -> float:
     """Slip of an axle: that of its worse wheel."""
     return left if abs(left) > abs(right) else right
+
+
+@kernel
+def driven_slip_for_gate(
+    slip: float, wheel_speed_radps: float, speed_mps: float, critical_slip: float, floor_mps: float, radius_m: float
+) -> float:
+    """Slip of a driven wheel as its gate takes it beside the limiter: at walking pace a matter of slip speed, too.
+
+    With the denominator of slip itself, a launch on ice would swing between its grip and nothing below 1.2 m/s: the
+    gate would take all torque away from a wheel that the limiter holds where it should. A braked wheel has to be inside
+    the critical slip as long as it can be told.
+    """
+    denominator = max(radius_m * wheel_speed_radps, speed_mps, floor_mps)
+    return slip * denominator / max(denominator, LEAST_GATED_MPS / critical_slip)
 
 
 @kernel

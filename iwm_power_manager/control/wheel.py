@@ -9,6 +9,7 @@ from iwm_power_manager.control.settings import GATE_MODE_LIMITER, GATE_MODE_OFF,
 from iwm_power_manager.control.slip import (
     LEAST_SLIP_SPEED_MPS,
     UNLIMITED_NM,
+    driven_slip_for_gate,
     filtered,
     gained_radps,
     limiter_torque_nm,
@@ -152,6 +153,9 @@ def wheel_of(
     gated = False
     # The brakes have to be able to hold a car at rest: what is slip there, sensors cannot tell.
     if settings.gate_mode != GATE_MODE_OFF and not (braking and speed_mps < settings.slip_speed_floor_mps):
+        if settings.gate_mode == GATE_MODE_LIMITER and not braking:
+            critical, floor = settings.critical_slip, settings.slip_speed_floor_mps
+            gate_slip = driven_slip_for_gate(gate_slip, wheel_speed_radps, speed_mps, critical, floor, radius)
         gated = axle_gated(
             gate_slip, demand_w, before.gated, settings.critical_slip, settings.gate_hysteresis, settings.gate_driving
         )

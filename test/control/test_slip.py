@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from iwm_power_manager.control.slip import (
     UNLIMITED_NM,
+    driven_slip_for_gate,
     filtered,
     gained_radps,
     limiter_torque_nm,
@@ -19,6 +20,7 @@ from iwm_power_manager.control.slip import (
     worse_slip,
 )
 from iwm_power_manager.control.types import initial_state
+from iwm_power_manager.model.tyre import slip_ratio
 from oracles import control_law as oracle
 
 RADIUS, INERTIA = 0.33, 1.1
@@ -110,3 +112,31 @@ def test_wheels_that_turn_alike_share_what_they_gain_and_others_have_their_own(b
     gained = gained_radps(own, now, other, there, RADIUS)
     mean = pytest.approx(0.5 * (own_gain + other_gain), abs=1e-9)
     assert gained == (mean if abs(now - there) * RADIUS < 0.3 else pytest.approx(own_gain, abs=1e-9))
+
+
+SPEED = st.one_of(st.floats(0.0, 3.0), st.floats(0.0, 60.0))
+TARGETS = st.sampled_from([(0.16, 0.2), (0.01, 0.2), (0.08, 0.1), (0.3, 0.5)])
+
+
+@given(SPEED, TARGETS, st.floats(0.1, 3.0))
+def test_a_driven_wheel_that_the_limiter_holds_at_its_target_is_short_of_the_gate_at_any_speed(speed, slips, floor):
+    target, critical = slips
+    # Where it wants no torque that the road does not take, there it holds the wheel.
+    low, high = speed / RADIUS, 2.0 * speed / RADIUS + 9.0
+    for _ in range(80):
+        wheel = 0.5 * (low + high)
+        room = limiter_torque_nm(False, 0.0, wheel, speed, target, 0.025, 0.0, RADIUS, INERTIA)
+        low, high = (low, wheel) if room == 0.0 else (wheel, high)
+    slip = driven_slip_for_gate(slip_ratio(wheel, speed, RADIUS, floor), wheel, speed, critical, floor, RADIUS)
+    assert slip <= max(target, 0.8 * critical) * (1.0 + 1e-9)
+
+
+@given(st.floats(0.0, 60.0), st.floats(0.0, 200.0), TARGETS, st.floats(0.1, 3.0))
+def test_the_gate_goes_by_the_slip_itself_unless_it_is_a_matter_of_walking_pace(speed, wheel, slips, floor):
+    critical = slips[1]
+    slip = slip_ratio(wheel, speed, RADIUS, floor)
+    for_gate = driven_slip_for_gate(slip, wheel, speed, critical, floor, RADIUS)
+    if max(speed, wheel * RADIUS, floor) * critical >= 0.375:
+        assert for_gate == pytest.approx(slip)
+    else:
+        assert for_gate == pytest.approx((wheel * RADIUS - speed) / 0.375 * critical)

@@ -379,6 +379,9 @@ def step(m, state, settings, vehicle, decide):
         for i, wheel in enumerate(axle.wheels, start=2 * k):
             own = axle.slip if settings.gate_mode == GATE_MODE_TABLE2 else wheel.slip
             edge = settings.critical_slip - (settings.gate_hysteresis if wheel.before.gated else 0.0)
+            if settings.gate_mode == GATE_MODE_LIMITER and not braking:
+                rim = max(wheel.speed * wheel.axle.wheel.radius_m, m.speed_mps, settings.slip_speed_floor_mps)
+                edge *= max(0.375 / settings.critical_slip / rim, 1.0)
             wheel.doubtful = abs(abs(own) - edge) < 1e-12
             if settings.gate_mode != GATE_MODE_OFF and m.power_demand_w != 0.0 and not standing:
                 spinning = settings.gate_driving and not braking and own > edge

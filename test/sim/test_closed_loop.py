@@ -170,6 +170,17 @@ def test_full_braking_stops_within_5_percent_of_the_best_constant_slip_without_l
         assert longest_s(axle < -0.2, 0.01) <= 0.1
 
 
+@pytest.mark.parametrize("friction", [0.1, 0.2, 0.3])
+def test_a_launch_on_ice_holds_the_wheels_at_their_grip_from_walking_pace_on(friction):
+    launch = run(make_cycle("launch", [0.0, 1.0, 11.0], [0.0, 0.0, 40.0]), CAR, EQUAL, TABLE, friction)
+    speed, motor = launch["speed_mps"], launch["front_motor_nm"]
+    first = int(np.argmax(launch["front_slip"] > 0.15))
+    assert speed[first] < 1.0, "the trace asks for more than the road gives from the first"
+    after = slice(first + 25, first + 400)
+    assert not launch["gate"][after].any()
+    assert motor[after].min() > 0.9 * motor[after].max()
+
+
 def test_without_skid_avoidance_the_wheels_lock():
     distance, slips = stop(0.2, GATE_MODE_OFF)
     assert slips.min() == -1.0
