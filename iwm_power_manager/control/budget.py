@@ -6,8 +6,8 @@ one; one by a quarter of the power or more counts as one, a smaller one in propo
 The price of a change goes by the mean of the three. What is budgeted is the second: it is never less than the number of
 changes by more than a quarter, and swinging just around that is no way out.
 
-Every change fills two buckets. One holds five minutes' budget and leaks at the rate of the budget: it leaves a busy
-stretch of a drive what quiet ones did not use. The other holds two and a half minutes' and leaks twice as fast:
+Every change fills two buckets. One holds five and a half minutes' budget and leaks at the rate of the budget: it leaves
+a busy stretch of a drive what quiet ones did not use. The other holds two and a half minutes' and leaks twice as fast:
 it keeps a single minute bearable. A share whose change does not fit into both, or from which the way back to the
 middle would not fit, is not offered: so no minute sees more than the budget and `burst`, no hour more than sixty
 budgets and the first bucket, whatever is driven, and nothing can hold the split at a share that has become wrong.
@@ -32,7 +32,7 @@ DEARER = (3.0, 9.0)
 #: A change and the way back to the middle, in changes: with less room a share that is left for another is not offered.
 THERE_AND_BACK = 2.0
 #: The first bucket holds this many minutes' budget; both hold at least one change and the way back.
-LASTING_MIN = 5.0
+LASTING_MIN = 5.5
 #: The second one holds this many, and leaks at this many times the budget.
 MINUTE_MIN, MINUTE_LEAK = 2.5, 2.0
 

@@ -52,7 +52,7 @@ def test_no_stretch_of_time_sees_more_than_its_budget_and_a_bucket(wishes, rate)
 
 def test_a_minute_may_have_28_changes_beyond_a_budget_of_8():
     assert budget.burst(8.0) == 28.0
-    assert budget.buckets(8.0) == (40.0, 20.0)
+    assert budget.buckets(8.0) == (44.0, 20.0)
     assert budget.buckets(0.1) == (2.0, 2.0)
 
 

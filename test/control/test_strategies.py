@@ -481,13 +481,13 @@ def test_a_change_gets_dearer_with_what_is_used_of_the_budget_and_at_last_there_
 
     free = dearest(0.0, 0.0)
     lasting, minute = [
-        [dearest(each, 0.0) for each in (4.0, 19.0, 36.0, 40.0)],
+        [dearest(each, 0.0) for each in (4.0, 21.0, 40.0, 44.0)],
         [dearest(0.0, each) for each in (4.0, 9.0, 16.0, 20.0)],
     ]
     for prices_at in (lasting, minute):
         assert free > prices_at[0] > prices_at[1] > prices_at[2] > prices_at[3] == 0.0
-    # Half of what a bucket of five minutes' budget holds: hardly dearer.
-    assert free / lasting[1] == pytest.approx(2.0**0.5 * (1.0 + np.pi / (2.0 * BUDGETED.elasticity * 38.0)), rel=0.05)
+    # Half of what a bucket of five and a half minutes' budget holds for a change and the way back: hardly dearer.
+    assert free / lasting[1] == pytest.approx(2.0**0.5 * (1.0 + np.pi / (2.0 * BUDGETED.elasticity * 42.0)), rel=0.05)
     assert free / minute[1] == pytest.approx(1.0 + np.pi / (2.0 * BUDGETED.elasticity * 18.0), rel=0.05)
 
 

@@ -143,7 +143,7 @@ def bellman(point, previous, table, outcome, used=(0.0, 0.0), steps=1.0, motors_
             trust = 0.5
             powers += [] if earlier_w is None else [earlier_w]
             steps += 0.5 * (0.8 / table.problem.dt_s - 1.0)
-        full = (max(5.0 * budget, 2.0), max(2.5 * budget, 2.0))
+        full = (max(5.5 * budget, 2.0), max(2.5 * budget, 2.0))
         # Both are full where a change and the way back have no room.
         holds = [max(size - 2.0, 1.0) for size in full]
         # The way back is set aside, and costs what the way there did.
