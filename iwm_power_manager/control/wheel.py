@@ -135,9 +135,8 @@ def wheel_of(
     radius = axle.wheel.radius_m
     # A braked wheel is not faster than the car: one that seems to be must not weaken the brakes.
     turning = min(wheel_speed_radps, FASTEST_BRAKED * speed_mps / radius) if braking else wheel_speed_radps
-    conversion = conversion_speed_radps(
-        turning, speed_mps, settings.critical_slip, radius, vehicle.driver.power_speed_floor_mps
-    )
+    critical, floor = settings.critical_slip, settings.slip_speed_floor_mps
+    conversion = conversion_speed_radps(turning, speed_mps, critical, radius, vehicle.driver.power_speed_floor_mps)
     if braking:
         conversion *= lower_part
     fast = max(wheel_speed_radps, conversion)
@@ -152,13 +151,10 @@ def wheel_of(
             road = 0.5 * (road + filtered(other_before.road_nm, other_taken, dt_s, settings.slip_filter_s))
     gated = False
     # The brakes have to be able to hold a car at rest: what is slip there, sensors cannot tell.
-    if settings.gate_mode != GATE_MODE_OFF and not (braking and speed_mps < settings.slip_speed_floor_mps):
+    if settings.gate_mode != GATE_MODE_OFF and not (braking and speed_mps < floor):
         if settings.gate_mode == GATE_MODE_LIMITER and not braking:
-            critical, floor = settings.critical_slip, settings.slip_speed_floor_mps
             gate_slip = driven_slip_for_gate(gate_slip, wheel_speed_radps, speed_mps, critical, floor, radius)
-        gated = axle_gated(
-            gate_slip, demand_w, before.gated, settings.critical_slip, settings.gate_hysteresis, settings.gate_driving
-        )
+        gated = axle_gated(gate_slip, demand_w, before.gated, critical, settings.gate_hysteresis, settings.gate_driving)
     grip = UNLIMITED_NM
     if settings.gate_mode == GATE_MODE_LIMITER:
         grip = limiter_torque_nm(
