@@ -164,7 +164,7 @@ def wheel_of(
             speed_mps,
             slip_target,
             settings.slip_limiter_s,
-            settings.slip_speed_floor_mps,
+            floor,
             radius,
             axle.wheel.inertia_kgm2,
         )

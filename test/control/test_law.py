@@ -173,6 +173,8 @@ SPEEDS = number(0, 60, 0, 0.5, 1, 2, 3)
 SLIPS = number(-1, 0.9, 0, 0.01, -0.01, 0.2, -0.2, -0.201, -0.15, 0.21)
 SPREADS = number(-5, 5, 0, 0)
 WHEELS = number(-60, 220, 0)
+#: At walking pace slip is a matter of its speed, m/s: about what the limiter holds, and where the gate begins.
+SLIP_SPEEDS = number(-0.5, 0.5, 0.3, -0.3, 0.25, 0.37)
 DEMANDS = st.one_of(number(1e-6, 40e3, 0, 0.5, 1e6, 30e3), number(-40e3, -1e-6, -0.5, -1e6))
 POWER_LIMITS = number(1e-3, 47500, 0, 47500)
 TORQUES = number(-100, 220, 0, 200, -80)
@@ -187,9 +189,10 @@ STEPS = st.sampled_from((0.001, 0.005, 0.01, 0.02, 0.1))
 @st.composite
 def measurements(draw, dt=STEPS):
     speed, spread = draw(SPEEDS), draw(SPREADS)
+    creeping = SLIP_SPEEDS.map(lambda apart: (speed + apart) / RADIUS)
     wheels = []
     for _ in range(2):
-        wheel = speed / RADIUS * (1.0 + draw(SLIPS)) if draw(st.booleans()) else draw(WHEELS)
+        wheel = draw(st.one_of(SLIPS.map(lambda slip: speed / RADIUS * (1.0 + slip)), WHEELS, creeping))
         wheels += [wheel, wheel + spread]
     return Measurement(speed, tuple(wheels), draw(DEMANDS), draw(dt), 0.9, draw(POWER_LIMITS), draw(POWER_LIMITS), 0.8)
 
